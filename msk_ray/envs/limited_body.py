@@ -1,4 +1,4 @@
-"""Costs of bodies with motors: of their actions, and of joints past the ends of their ranges."""
+"""What bodies with motors that go along +x have in common, and their terms."""
 
 from functools import cached_property
 from typing import Any, TypeVar
@@ -13,6 +13,9 @@ from msk_ray.step import StepState
 
 _UNIT = 0.1
 """Overshoot of one joint that counts as 1 [rad]."""
+_DEEPEST = -1.0
+_DROP = 200.0
+"""Weight of the squared depth below the full height [1/m²]."""
 
 
 def squared_overshoot(angles: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -22,11 +25,17 @@ def squared_overshoot(angles: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return (torch.maximum(low - angles, angles - high).clamp_min(0.0) / _UNIT).square().sum(-1)
 
 
+def worth_of_height(above: Tensor, top: float, weight: float) -> Tensor:
+    """What heights above the full height are worth, up to `top` [m]; depths below it cost their squares, up to 1 m."""
+    above = above.clamp(_DEEPEST, top)
+    return torch.where(above < 0.0, -_DROP * above.square(), weight * above)
+
+
 LimitedT = TypeVar("LimitedT", bound=LimitedSettings)
 
 
 class LimitedBody(Env[LimitedT]):
-    """A body whose limited joints are hinges, and the last ones of the model."""
+    """A body whose limited joints are hinges, and the last ones of the model; its first joint moves along x."""
 
     @classmethod
     def reference_settings(cls, config: LimitedT) -> LimitedT:
@@ -41,6 +50,9 @@ class LimitedBody(Env[LimitedT]):
         ranges = torch.tensor(self.model.jnt_range[first:], dtype=torch.float32, device=self.device)
         low, high = ranges.unbind(-1)
         return int(self.model.jnt_qposadr[first]), low, high
+
+    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
+        return {"vx": state.qvel[:, 0]}
 
 
 def effort(env: Env[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:

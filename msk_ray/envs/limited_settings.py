@@ -16,6 +16,18 @@ class LimitedSettings(EnvSettings):
         return ramp(1.0, 0.0, epoch, self.joint_limit_epochs) if self.joint_limit_epochs else 1.0
 
 
+class FallingSettings(LimitedSettings):
+    """The settings of a body that can fall."""
+
+    termination_height: float
+    """Height of the torso below which an episode ends [m]."""
+    early_termination: bool = True
+    """End an episode on falling below `termination_height`."""
+
+    def unread(self) -> dict[str, str]:
+        return {} if self.early_termination else {"termination_height": "env.early_termination is false"}
+
+
 EFFORT = "msk_ray.envs.limited_body:effort"
 JOINT_LIMIT = Cost(
     "joint_limit",

@@ -27,6 +27,3 @@ class PlanarBody(LimitedBody[LimitedT]):
             for name, slide in zip(names, slides, strict=True)
         ]
         return [*places[1:], *rates]
-
-    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
-        return {"vx": state.qvel[:, 0]}

@@ -9,15 +9,12 @@ from torch import Tensor
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.ant.config import TERMS, AntSettings
 from msk_ray.envs.ant.model import STAND_HEIGHT, STAND_JOINTS, build_ant
-from msk_ray.envs.layout import Entry, entries, floating_body
-from msk_ray.envs.limited_body import LimitedBody
+from msk_ray.envs.floating import JOINT_VELOCITY_SCALE, FloatingBody
 from msk_ray.step import StepState
 from msk_ray.step.autograd.tangent import quat_exp, quat_multiply, quat_rotate
 
-_JOINT_VELOCITY_SCALE = 0.1
 
-
-class Ant(LimitedBody[AntSettings]):
+class Ant(FloatingBody[AntSettings]):
     """Observation (37), in this order:
 
     ====== ===========================================================
@@ -35,6 +32,7 @@ class Ant(LimitedBody[AntSettings]):
 
     Settings = AntSettings
     terms = TERMS
+    cosine_names = ("up_cosine", "forward_cosine")
 
     @classmethod
     def build_model(cls, config: AntSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -63,32 +61,12 @@ class Ant(LimitedBody[AntSettings]):
                 state.qvel[:, 0:3],
                 quat_rotate(orientation, state.qvel[:, 3:6]),  # MuJoCo's angular velocity is in the body frame
                 state.qpos[:, 7:],
-                _JOINT_VELOCITY_SCALE * state.qvel[:, 6:],
+                JOINT_VELOCITY_SCALE * state.qvel[:, 6:],
                 orientation.square() @ self._axes,
                 action,
             ),
             dim=-1,
         )
-
-    def observation_layout(self) -> list[Entry]:
-        return [
-            *floating_body(self.model),
-            *entries(("up_cosine", "forward_cosine")),
-            *entries(f"last_action_{i}" for i in range(self.action_size)),
-        ]
-
-    def fell(self, state: StepState) -> Tensor:
-        if not self.config.early_termination:
-            return super().fell(state)
-        return state.qpos[:, 2] < self.config.termination_height
-
-    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
-        return {"vx": state.qvel[:, 0]}
-
-
-def forward_vel(env: Ant, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """The torso's velocity along +x [m/s]."""
-    return obs[:, 5]
 
 
 def up(env: Ant, state: StepState, action: Tensor, obs: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from msk_ray.config.physics import CONTACTS, SOLVING, STEPPING
 from msk_ray.config.rewards import reward_section, with_reward
 from msk_ray.config.sections import Count, Reward
 from msk_ray.config.terms import Cost, Term, terms_in
-from msk_ray.envs.limited_settings import EFFORT, JOINT_LIMIT, LimitedSettings
+from msk_ray.envs.limited_settings import EFFORT, JOINT_LIMIT, FallingSettings
 
 
 class HopperHeight(Reward):
@@ -26,7 +26,7 @@ HopperReward = reward_section("HopperReward", __name__, TERMS, HopperHeight)
 
 
 @with_reward(HopperReward)
-class HopperSettings(LimitedSettings):
+class HopperSettings(FallingSettings):
     """A planar body on one leg whose reward asks for forward velocity."""
 
     variants = ("matched", "published")
@@ -37,8 +37,3 @@ class HopperSettings(LimitedSettings):
     reward: HopperHeight = HopperHeight()
     termination_height: float = -0.45
     """Height of the torso, from 1.25 m, below which an episode ends [m]."""
-    early_termination: bool = True
-    """End an episode on falling below `termination_height`."""
-
-    def unread(self) -> dict[str, str]:
-        return {} if self.early_termination else {"termination_height": "env.early_termination is false"}

@@ -9,6 +9,7 @@ from torch import Tensor
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.hopper.config import TERMS, HopperSettings
 from msk_ray.envs.hopper.model import build_hopper
+from msk_ray.envs.limited_body import worth_of_height
 from msk_ray.envs.planar import PlanarBody
 from msk_ray.step import StepState
 
@@ -16,9 +17,7 @@ _FULL_ANGLE = math.pi / 6
 _FULL_HEIGHT = -0.3
 """Height of the torso, from 1.25 m, that costs and earns nothing [m]."""
 _TOP = 0.3
-_BOTTOM = -1.0
-_DROP = 200.0
-"""Weight of the squared depth below it [1/m²]."""
+"""Largest height above it that earns something [m]."""
 
 
 class Hopper(PlanarBody[HopperSettings]):
@@ -58,8 +57,7 @@ def forward_vel(env: Hopper, state: StepState, action: Tensor, obs: Tensor) -> T
 
 def height(env: Hopper, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
     """What the torso's height above or below the full height is worth."""
-    above = (obs[:, 0] - _FULL_HEIGHT).clamp(_BOTTOM, _TOP)
-    return torch.where(above < 0.0, -_DROP * above.square(), env.config.reward.height * above)
+    return worth_of_height(obs[:, 0] - _FULL_HEIGHT, _TOP, env.config.reward.height)
 
 
 def upright(env: Hopper, state: StepState, action: Tensor, obs: Tensor) -> Tensor:

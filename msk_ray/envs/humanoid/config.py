@@ -4,7 +4,7 @@ from msk_ray.config.physics import CONTACTS, SOLVING, STEPPING
 from msk_ray.config.rewards import reward_section, with_reward
 from msk_ray.config.sections import Count, Reward
 from msk_ray.config.terms import Cost, Term, terms_in
-from msk_ray.envs.limited_settings import EFFORT, JOINT_LIMIT, LimitedSettings
+from msk_ray.envs.limited_settings import EFFORT, JOINT_LIMIT, FallingSettings
 
 
 class HumanoidHeight(Reward):
@@ -16,7 +16,7 @@ class HumanoidHeight(Reward):
 
 TERMS = terms_in(
     "msk_ray.envs.humanoid.env",
-    Term("forward_vel", 1.0),
+    Term("forward_vel", 1.0, "msk_ray.envs.floating:forward_vel"),
     Term("up", 0.1),
     Term("heading", 1.0),
     Term("height", None),
@@ -27,7 +27,7 @@ HumanoidReward = reward_section("HumanoidReward", __name__, TERMS, HumanoidHeigh
 
 
 @with_reward(HumanoidReward)
-class HumanoidSettings(LimitedSettings):
+class HumanoidSettings(FallingSettings):
     """A walker on two legs whose reward asks for forward velocity."""
 
     variants = ("matched", "published")
@@ -37,9 +37,3 @@ class HumanoidSettings(LimitedSettings):
     episode_length: Count = 1000
     reward: HumanoidHeight = HumanoidHeight()
     termination_height: float = 0.74
-    """Torso height below which an episode ends [m]."""
-    early_termination: bool = True
-    """End an episode on falling below `termination_height`."""
-
-    def unread(self) -> dict[str, str]:
-        return {} if self.early_termination else {"termination_height": "env.early_termination is false"}

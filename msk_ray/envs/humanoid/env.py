@@ -7,24 +7,21 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
+from msk_ray.envs.floating import JOINT_VELOCITY_SCALE, FloatingBody
 from msk_ray.envs.humanoid.config import TERMS, HumanoidSettings
 from msk_ray.envs.humanoid.model import START_HEIGHT, build_humanoid
-from msk_ray.envs.layout import Entry, entries, floating_body
-from msk_ray.envs.limited_body import LimitedBody
+from msk_ray.envs.limited_body import worth_of_height
 from msk_ray.step import StepState
 from msk_ray.step.autograd.tangent import quat_exp, quat_rotate
 
-_JOINT_VELOCITY_SCALE = 0.1
 _TARGET = 200.0
 _FULL_HEIGHT = 0.84
 """Height of the torso that costs and earns nothing [m]."""
 _TOP = 0.1
-_BOTTOM = -1.0
-_DROP = 200.0
-"""Weight of the squared depth below it [1/m²]."""
+"""Largest height above it that earns something [m]."""
 
 
-class Humanoid(LimitedBody[HumanoidSettings]):
+class Humanoid(FloatingBody[HumanoidSettings]):
     """Observation (76), in this order; source: `envs/humanoid.py` of github.com/NVlabs/DiffRL.
 
     ====== ==========================================================================================
@@ -43,6 +40,7 @@ class Humanoid(LimitedBody[HumanoidSettings]):
 
     Settings = HumanoidSettings
     terms = TERMS
+    cosine_names = ("up_cosine", "heading_cosine")
 
     @classmethod
     def build_model(cls, config: HumanoidSettings, physics: PhysicsConfig) -> mujoco.MjModel:
@@ -71,7 +69,7 @@ class Humanoid(LimitedBody[HumanoidSettings]):
                 state.qvel[:, 0:3],
                 quat_rotate(orientation, state.qvel[:, 3:6]),  # MuJoCo's angular velocity is in the body frame
                 state.qpos[:, 7:],
-                _JOINT_VELOCITY_SCALE * state.qvel[:, 6:],
+                JOINT_VELOCITY_SCALE * state.qvel[:, 6:],
                 # World z of the torso's z axis is 1 - 2 (x² + y²).
                 1.0 - 2.0 * orientation[:, 1:3].square().sum(-1, keepdim=True),
                 (forward[:, 0:2] * way).sum(-1, keepdim=True),
@@ -79,26 +77,6 @@ class Humanoid(LimitedBody[HumanoidSettings]):
             ),
             dim=-1,
         )
-
-    def observation_layout(self) -> list[Entry]:
-        return [
-            *floating_body(self.model),
-            *entries(("up_cosine", "heading_cosine")),
-            *entries(f"last_action_{i}" for i in range(self.action_size)),
-        ]
-
-    def fell(self, state: StepState) -> Tensor:
-        if not self.config.early_termination:
-            return super().fell(state)
-        return state.qpos[:, 2] < self.config.termination_height
-
-    def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
-        return {"vx": state.qvel[:, 0]}
-
-
-def forward_vel(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """The torso's velocity along +x [m/s]."""
-    return obs[:, 5]
 
 
 def up(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -113,5 +91,4 @@ def heading(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Ten
 
 def height(env: Humanoid, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
     """What the torso's height above or below the full height is worth."""
-    above = (obs[:, 0] - _FULL_HEIGHT).clamp(_BOTTOM, _TOP)
-    return torch.where(above < 0.0, -_DROP * above.square(), env.config.reward.height * above)
+    return worth_of_height(obs[:, 0] - _FULL_HEIGHT, _TOP, env.config.reward.height)
