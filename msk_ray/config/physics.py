@@ -107,6 +107,11 @@ class PhysicsConfig(Section):
             *(f"fd.{name}" for name in FdConfig.model_fields),
         ]
 
+    def in_substeps(self, count: int) -> "PhysicsConfig":
+        """These settings with `count` physics steps per env step if they say neither that nor their duration."""
+        given = self.substeps is not None or self.timestep is not None
+        return self if given else self.model_copy(update={"substeps": count})
+
     def resolve_substeps(self, control_timestep: float) -> int:
         """Physics steps per env step of `control_timestep` [s].
 

@@ -1,4 +1,4 @@
-"""Force of Hill-type muscles as torch functions, the same as MuJoCo's.
+"""A model's muscles, and the force of Hill-type muscles as torch functions, the same as MuJoCo's.
 
 Axes: W worlds, U muscles.
 """
@@ -15,6 +15,18 @@ from torch.autograd.function import once_differentiable
 from msk_ray.errors import UnsupportedModelError
 
 
+def muscles_of(model: mujoco.MjModel) -> np.ndarray:
+    """Indices of the muscles among a model's actuators, (U,)."""
+    return np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
+
+
+def smooth_activation(spec: mujoco.MjSpec, width: float) -> None:
+    """Blend muscles' activation into deactivation over a width in excitation: a hard switch has no slope."""
+    for actuator in spec.actuators:
+        if actuator.dyntype == mujoco.mjtDyn.mjDYN_MUSCLE:
+            actuator.dynprm[2] = width
+
+
 class MuscleCurves:
     """Curves of a model's muscles, in actuator order.
 
@@ -29,7 +41,7 @@ class MuscleCurves:
     """
 
     def __init__(self, model: mujoco.MjModel, device: torch.device) -> None:
-        found = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
+        found = muscles_of(model)
         through_tendon = model.actuator_trntype[found] == int(mujoco.mjtTrn.mjTRN_TENDON)
         if not np.all(through_tendon & (model.actuator_gear[found, 0] == 1.0)):
             raise UnsupportedModelError("muscles must pull on tendons with a gear of 1 to be observed")

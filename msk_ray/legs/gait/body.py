@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from msk_ray.errors import ConfigError, SimulationError
 from msk_ray.legs.gait.people import ALIASES
 from msk_ray.legs.metabolic import muscle_masses, total_power
-from msk_ray.legs.muscles import MuscleCurves
+from msk_ray.legs.muscles import MuscleCurves, muscles_of
 
 Array = NDArray[np.float64]
 SIDES = ("r", "l")
@@ -138,7 +138,7 @@ def analyse(model: mujoco.MjModel, qpos: Array, qvel: Array, act: Array, timeste
     angles = {name: _angles(model, joint, qpos) for name, joint in JOINTS.items()}
     owners = [_carried_by(model, model.body(f"talus_{side}").id) for side in SIDES]
     weight = float(np.linalg.norm(model.opt.gravity) * model.body_subtreemass[0])
-    muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
+    muscles = muscles_of(model)
     bodies = [model.body(name).id for name in ("pelvis", *(f"calcn_{side}" for side in SIDES))]
     data = mujoco.MjData(model)
     count = len(qpos)
@@ -175,8 +175,7 @@ def metabolic_power(model: mujoco.MjModel, act: Array, lengths: Array, rates: Ar
 
 
 def _activations(model: mujoco.MjModel, act: Array) -> dict[str, dict[str, Array]]:
-    muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
-    columns = {model.actuator(int(i)).name: k for k, i in enumerate(muscles)}
+    columns = {model.actuator(int(i)).name: k for k, i in enumerate(muscles_of(model))}
     found = {}
     for name, aliases in ALIASES.items():
         known = [alias for alias in aliases if all(f"{alias}_{side}" in columns for side in SIDES)]

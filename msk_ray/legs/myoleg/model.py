@@ -13,6 +13,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
 from msk_ray.legs.gait.body import JOINTS, SIDES, flexion_sign, world_axes
+from msk_ray.legs.muscles import smooth_activation
 from msk_ray.legs.myoleg.config import MyoLegSettings
 from msk_ray.legs.myoleg.source import find_model
 from msk_ray.legs.reference import adduction_under, level_toes, people_angles, sway
@@ -38,12 +39,8 @@ def build_myoleg(env: MyoLegSettings, physics: PhysicsConfig) -> mujoco.MjModel:
     """
     source = find_model(env.model, env.source)
     spec = source.load()
-    if physics.substeps is None and physics.timestep is None:
-        physics = physics.model_copy(update={"substeps": SUBSTEPS})
-    apply_options(spec, physics, env.control_timestep)
-    for actuator in spec.actuators:
-        if actuator.dyntype == mujoco.mjtDyn.mjDYN_MUSCLE:
-            actuator.dynprm[2] = SMOOTHING
+    apply_options(spec, physics.in_substeps(SUBSTEPS), env.control_timestep)
+    smooth_activation(spec, SMOOTHING)
     if source.package != "file":
         _keep_plane_contacts(spec)
     for key in list(spec.keys):

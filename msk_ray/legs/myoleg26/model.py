@@ -67,11 +67,9 @@ def resolve_physics(physics: PhysicsConfig) -> PhysicsConfig:
     )
     given = {name for name in type(own).model_fields if getattr(physics, name) is not None}
     values = {name: getattr(own, name) for name in type(own).model_fields if name not in given}
-    if physics.substeps is None and physics.timestep is None:
-        values["substeps"] = SUBSTEPS
     if physics.cone == "pyramidal":
         values["solreffriction"] = None
-    return physics.model_copy(update=values)
+    return physics.model_copy(update=values).in_substeps(SUBSTEPS)
 
 
 SUBSTEPS = 5

@@ -7,6 +7,7 @@ import mujoco
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.options import apply_options
 from msk_ray.errors import ConfigError
+from msk_ray.legs.muscles import smooth_activation
 from msk_ray.legs.myoleg.source import spec_of_file
 from msk_ray.legs.myosuite_walk.config import MyoSuiteWalkSettings
 from msk_ray.legs.myosuite_walk.source import INSTALL, find_file
@@ -32,12 +33,8 @@ def build_myosuite_walk(env: MyoSuiteWalkSettings, physics: PhysicsConfig) -> mu
     """
     path = find_file(env.model)
     spec = spec_of_file(path)
-    if physics.substeps is None and physics.timestep is None:
-        physics = physics.model_copy(update={"substeps": SUBSTEPS})
-    apply_options(spec, physics, env.control_timestep)
-    for actuator in spec.actuators:
-        if actuator.dyntype == mujoco.mjtDyn.mjDYN_MUSCLE:
-            actuator.dynprm[2] = env.smoothing
+    apply_options(spec, physics.in_substeps(SUBSTEPS), env.control_timestep)
+    smooth_activation(spec, env.smoothing)
     for geom in list(spec.geoms):
         if geom.type == mujoco.mjtGeom.mjGEOM_HFIELD:
             spec.delete(geom)
