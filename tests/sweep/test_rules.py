@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from msk_ray.errors import ConfigError
 from msk_ray.experiment.metrics import Evaluation, evaluations_of
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.scheduler_log import LogEntry
@@ -13,6 +14,7 @@ from msk_ray.sweep.rules.plateau import Plateau
 from msk_ray.sweep.rules.scheduler import replay
 from msk_ray.sweep.rules.stop_rule import History
 from msk_ray.sweep.rules.stopping import StopSpec
+from msk_ray.sweep.space import read_file
 
 
 def evaluations(*scores: float) -> list[Evaluation]:
@@ -123,6 +125,13 @@ def test_median_of_a_space_waits_for_three_others_and_its_grace() -> None:
     assert two.report("low", 100, 1.0) is None
     two.report("c", 100, 2.0)
     assert two.report("low", 110, 1.0) is not None
+
+
+def test_null_is_a_default_in_recorded_spaces_alone() -> None:
+    data = {"question": "?", "base": "b", "scheduler": {"kind": "median", "min_trials": None}}
+    assert read_file(data, "space", recorded=True) == read_file({**data, "scheduler": {"kind": "median"}}, "space")
+    with pytest.raises(ConfigError, match="min_trials"):
+        read_file(data, "space")
 
 
 def test_median_in_lockstep_compares_where_the_others_have_been() -> None:

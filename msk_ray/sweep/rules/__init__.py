@@ -26,7 +26,7 @@ SCHEDULERS = Registry(
 RECORDED = {"recorded": True}
 """Validation context for a space recorded by an experiment."""
 _SHARED = frozenset({"time_attr", "grace", "reduction", "min_trials", "interval", "quantile", "resample"})
-"""Settings that older versions recorded for every rule, used or not."""
+"""Settings that older versions recorded for every rule, used or not; null meant a rule's default."""
 
 
 def scheduler_class(name: Any) -> type[SchedulerSpec]:
@@ -47,7 +47,7 @@ def read_scheduler(value: Any, info: ValidationInfo) -> Any:
     except ConfigError as error:
         raise ValueError(str(error)) from error
     if info.context == RECORDED:
-        unread = _SHARED - kind.model_fields.keys()
+        unread = {key for key in _SHARED if key not in kind.model_fields or value.get(key) is None}
         value = {key: setting for key, setting in value.items() if key not in unread}
         if value.get("kind") == "none":
             value.pop("time_attr", None)

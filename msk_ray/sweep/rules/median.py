@@ -15,17 +15,17 @@ class Median(SchedulerSpec):
 
     grace: Share = 0.25
     """Share of the longest trial's budget within which no trial is stopped."""
-    min_trials: Count | None = None
-    """Number of other trials that must have reached the same time before one is stopped; null: 3."""
+    min_trials: Count = 3
+    """Number of other trials that must have reached the same time before one is stopped."""
 
     def pruner(self, budget: float) -> Pruner:
-        return MedianStopping(self.grace * budget, self.min_trials or 3)
+        return MedianStopping(self.grace * budget, self.min_trials)
 
 
 class MedianStopping:
     """Stops a trial whose best score is below the median of the other trials' mean scores up to the same time."""
 
-    def __init__(self, grace: float, min_trials: int = 3) -> None:
+    def __init__(self, grace: float, min_trials: int) -> None:
         """
         Args:
             grace: time before which no trial is stopped.
