@@ -53,7 +53,7 @@ EDITS: dict[str, tuple[str, ...]] = {
     "operator": (r"^OPERATORS = Registry",),
     "stop rule": (r"^class StopSpec",),
     "logger": (r"^LOGGERS = Registry",),
-    "exporter": (r"^_WRITERS = ", r'"--torchscript"', r'"torchscript": args\.torchscript', r'"torchscript": "\.pt"'),
+    "exporter": (r"^FORMATS = ",),
     "command": (r"^COMMANDS = ",),
     "setting of the physics": (r"^class PhysicsConfig", r"^SOLVING = ", r"^def _unread\("),
 }

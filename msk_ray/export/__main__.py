@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from msk_ray.cli import STORAGE, Parser, run
+from msk_ray.config.packages import require
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import REFERENCE, best_checkpoint, find_target
+from msk_ray.export.formats import FORMATS
 from msk_ray.files import make_folder
 from msk_ray.progress import announce
 from msk_ray.sweep.space import parse_seeds
@@ -45,8 +47,8 @@ def parser() -> Parser:
         metavar="CHECKPOINT|TRIAL|EXPERIMENT",
         help="a .pt file, a folder, or a name; its best policy is exported",
     )
-    p.add_argument("--onnx", type=Path, metavar="FILE", help="an .onnx file; needs msk-ray[export]")
-    p.add_argument("--torchscript", type=Path, metavar="FILE", help="a .pt file")
+    for name, format in FORMATS.items():
+        p.add_argument(f"--{name}", type=Path, metavar="FILE", help=format.help)
     p.add_argument(
         "--physics",
         metavar="NAME",
@@ -73,8 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
     checkpoint = best_checkpoint(find_target(args.target, args.storage))
-    wanted = {"onnx": args.onnx, "torchscript": args.torchscript}
-    paths = {kind: path for kind, path in wanted.items() if path is not None}
+    paths = {name: path for name in FORMATS if (path := getattr(args, name)) is not None}
     if args.zoo is not None:
         return _add_to_zoo(args, checkpoint, bool(paths))
     given = [name for name in _ZOO_OPTIONS if getattr(args, name) is not None]
@@ -85,10 +86,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     announce(f"exporting {checkpoint}")
     from msk_ray.export.write import export
 
-    if "onnx" in paths:
-        from msk_ray.export.network import check_packages
-
-        check_packages()
     for line in export(checkpoint, paths, args.physics or REFERENCE):
         print(line, flush=True)
     return 0
@@ -118,13 +115,15 @@ def _add_to_zoo(args: argparse.Namespace, checkpoint: Path, files: bool) -> int:
 
 def _check_paths(paths: dict[str, Path], checkpoint: Path) -> None:
     if not paths:
-        raise ConfigError("nothing to write: give --onnx FILE, --torchscript FILE or both, or --zoo FOLDER/NAME")
-    for kind, path in paths.items():
-        suffix = {"onnx": ".onnx", "torchscript": ".pt"}[kind]
-        if path.suffix != suffix:
-            raise ConfigError(f"--{kind} {path}: write a name that ends in {suffix}")
+        options = ", ".join(f"--{name} FILE" for name in FORMATS)
+        raise ConfigError(f"nothing to write: give {options} or --zoo FOLDER/NAME")
+    for name, path in paths.items():
+        format = FORMATS[name]
+        if path.suffix != format.suffix:
+            raise ConfigError(f"--{name} {path}: write a name that ends in {format.suffix}")
         if path.resolve() == checkpoint:
-            raise ConfigError(f"--{kind} {path}: this is the checkpoint itself; write another name")
+            raise ConfigError(f"--{name} {path}: this is the checkpoint itself; write another name")
+        require(format.packages, f"--{name}")
         make_folder(path.parent)
 
 

@@ -25,7 +25,7 @@ def describe(
         policy: the policy that was exported.
         env: its environment.
         physics: name of the physics of the model.
-        files: names of the files by kind: `onnx`, `torchscript`, `model`.
+        files: names of the files by their names in `FORMATS`, and that of the `model`.
 
     Raises:
         ConfigError: the environment's layout does not fit its observation.

@@ -8,7 +8,6 @@ import logging
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor, nn
 
 from msk_ray.envs import Env
 from msk_ray.envs.records import EnvState
-from msk_ray.errors import ConfigError, ExportError
+from msk_ray.errors import ExportError
 from msk_ray.export.memory import NOISE, carried_memory
 from msk_ray.step import StepState
 
@@ -29,7 +28,6 @@ STEPS = 50
 """Env steps over which one that remembers is compared."""
 WORLDS = 8
 """Worlds whose initial states give the observations."""
-_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
 
 Runner = Callable[..., list[Tensor]]
 """Runs an exported policy on its inputs."""
@@ -211,13 +209,6 @@ def observations(env: Env[Any], seed: int) -> Tensor:
         drawn.append(env.observation().cpu())
     obs = torch.cat(drawn)[:CHECKED]
     return obs + NOISE * torch.randn(obs.shape, generator=generator)
-
-
-def check_packages() -> None:
-    """Raise ConfigError if a package that ONNX needs is not installed."""
-    missing = [name for name in _PACKAGES if find_spec(name) is None]
-    if missing:
-        raise ConfigError(f"--onnx needs {', '.join(missing)}: pip install 'msk-ray[export]'")
 
 
 @torch.no_grad()

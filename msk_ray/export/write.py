@@ -10,23 +10,20 @@ import numpy as np
 from msk_ray.envs import Env, env_class, make_env
 from msk_ray.evaluate.measure import named_physics
 from msk_ray.export.description import describe
+from msk_ray.export.formats import FORMATS
 from msk_ray.export.network import (
     CHECKED,
     WORLDS,
     PolicyToControl,
     compare,
     observations,
-    to_onnx,
-    to_torchscript,
 )
 from msk_ray.files import write_bytes, write_json
 from msk_ray.training import SavedPolicy, load_policy
 
-_WRITERS = {"onnx": to_onnx, "torchscript": to_torchscript}
-
 
 def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterator[str]:
-    """Write the policy of a checkpoint to each of `paths`, by kind (`onnx`, `torchscript`), and a .json and an .mjb of
+    """Write the policy of a checkpoint to each of `paths`, by its name in `FORMATS`, and a .json and an .mjb of
     the same name. Yields a line about each file.
 
     Args:
@@ -41,15 +38,15 @@ def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterato
     seed = saved.config.evaluation.seed
     inputs = policy.examples(observations(env, seed), seed)
     checked = {}
-    for kind in paths:
-        payload, runner = _WRITERS[kind](policy, *inputs)
-        checked[kind] = payload, compare(policy, runner, env, *inputs)
+    for name in paths:
+        payload, runner = FORMATS[name].write(policy, *inputs)
+        checked[name] = payload, compare(policy, runner, env, *inputs)
     descriptions: dict[Path, dict[str, str]] = {}
-    for kind, path in paths.items():
-        payload, difference = checked[kind]
+    for name, path in paths.items():
+        payload, difference = checked[name]
         write_bytes(path, payload)
         yield f"{path}: {len(payload)} bytes, differs by at most {difference:.0e} on {CHECKED} observations"
-        descriptions.setdefault(path.with_suffix(".json"), {})[kind] = path.name
+        descriptions.setdefault(path.with_suffix(".json"), {})[name] = path.name
     for path, files in descriptions.items():
         model = path.with_suffix(".mjb")
         write_bytes(model, model_bytes(env.model))

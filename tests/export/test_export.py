@@ -15,7 +15,7 @@ from myosuite_model import walk_model
 
 import msk_ray
 from msk_ray.cli import run
-from msk_ray.config import PhysicsConfig, load_config
+from msk_ray.config import PhysicsConfig, load_config, packages
 from msk_ray.envs import make_env
 from msk_ray.envs.cartpole.config import CartPoleSettings
 from msk_ray.envs.cartpole.env import CartPole
@@ -108,7 +108,7 @@ def test_what_differs_is_refused_and_nothing_is_written(
         payload, runner = right(policy, obs)
         return payload, lambda obs: [part + 2e-5 for part in runner(obs)]
 
-    monkeypatch.setitem(sys.modules["msk_ray.export.write"]._WRITERS, "torchscript", wrong)
+    monkeypatch.setattr(network, "to_torchscript", wrong)
     assert run(main, ["cartpole", "--torchscript", str(tmp_path / "p.pt")]) == ExportError.exit_code
     (error,) = capsys.readouterr().err.splitlines()[-1:]
     assert "not written: its action differs from the checkpoint's by 2.0e-05" in error
@@ -196,10 +196,13 @@ def test_a_layout_of_another_length_is_refused(env: CartPole) -> None:
         describe(msk_ray.load_policy(CHECKPOINT), policy, mislaid, "own", {})
 
 
-def test_without_onnx_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(network, "find_spec", lambda name: None if name == "onnxruntime" else object())
-    with pytest.raises(ConfigError, match=r"--onnx needs onnxruntime: pip install 'msk-ray\[export\]'"):
-        network.check_packages()
+def test_without_onnx_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(packages, "find_spec", lambda name: None if name == "onnxruntime" else object())
+    assert run(main, ["cartpole", "--onnx", str(tmp_path / "p.onnx")]) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert "--onnx needs the package onnxruntime, which is not installed: pip install 'msk-ray[export]'" in error
 
 
 @pytest.mark.parametrize("name", ["cartpole", "ant", "cheetah", "myoleg26", "myosuite_walk"])
