@@ -48,18 +48,17 @@ def open_file(path: Path, *, follow: bool = False) -> BinaryIO:
     return os.fdopen(_open(path, os.O_RDONLY, follow), "rb")
 
 
-def read_file(path: Path, limit: int, *, follow: bool = False) -> bytes:
+def read_file(path: Path, limit: int) -> bytes:
     """The content of a regular file.
 
     Args:
         limit: maximum size [B].
-        follow: follow a symbolic link, for a file named by the user.
 
     Raises:
         UnusableFile: it is not a regular file, or larger.
         OSError: it does not exist, or cannot be read.
     """
-    with open_file(path, follow=follow) as file:
+    with open_file(path) as file:
         if os.fstat(file.fileno()).st_size <= limit:
             data = file.read(limit + 1)  # it may be growing
             if len(data) <= limit:

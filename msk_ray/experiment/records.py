@@ -116,7 +116,7 @@ class ExperimentReader:
 
 def read_record(trial: Trial, folder: Path) -> TrialRecord:
     """A trial's record; an empty one if it never started."""
-    return TrialRecord(**vars(read_trial(folder, time.time())), trial=trial)
+    return TrialRecord(**vars(read_trial(folder)), trial=trial)
 
 
 def read_records(experiment: Experiment) -> list[TrialRecord]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -238,9 +239,9 @@ class TrialReader:
         return reading
 
 
-def read_trial(folder: Path, now: float = 0.0) -> TrialSnapshot:
-    """A trial's folder at `now` [s since the epoch], which only serves to tell running trials from silent ones."""
-    return TrialReader().read(folder, now)
+def read_trial(folder: Path) -> TrialSnapshot:
+    """A trial's folder now."""
+    return TrialReader().read(folder, time.time())
 
 
 def _try(read: Callable[[], T], otherwise: T, path: Path, damages: list[Damage]) -> T:

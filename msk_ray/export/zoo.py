@@ -2,7 +2,6 @@
 
 import io
 import tempfile
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -144,7 +143,7 @@ def _without_folders(words: Sequence[str]) -> str:
 
 def _machine(folder: Path, recorded: Mapping[str, Any], config: Config) -> str | None:
     """The GPUs of a trial, or `CPU`; None if it does not say."""
-    name = recorded.get("device") or read_trial(folder, time.time()).device.name
+    name = recorded.get("device") or read_trial(folder).device.name
     if not name:
         return None
     return "CPU" if name == "cpu" else f"{config.execution.gpus} × {name}"

@@ -35,7 +35,7 @@ from msk_ray.report.charts import (
     thin_evenly,
     thin_peaks,
 )
-from msk_ray.report.reading import Reading
+from msk_ray.report.reading import Reading, scores_of
 from msk_ray.sweep.budget import extreme_configs, longest_budget
 from msk_ray.sweep.space import recorded_space
 from msk_ray.text import printable
@@ -98,7 +98,7 @@ def learning_curves(
         places: trials' positions in the page's list.
         over: the x axis, `env_steps` or `seconds`.
     """
-    means = {v: float(np.mean(scores)) for v, trials in groups.items() if (scores := _best_scores(trials))}
+    means = {v: float(np.mean(scores)) for v, trials in groups.items() if (scores := scores_of(trials))}
     curves = {v: [curve for t in groups[v] if len((curve := curve_over(t, over))[0])] for v in means}
     until = {v: _first_end(groups[v], over) for v in means}
     axis, more = _OVER[over]
@@ -198,10 +198,6 @@ def _floor(curves: Sequence[Curve]) -> Floor | None:
     left = sum(low < bottom for low in lowest)
     trials = "1 trial goes" if left == 1 else f"{left} trials go"
     return Floor(float(f"{bottom:.3g}"), f"▼ {trials} below this axis, down to {min(lowest):.4g}")
-
-
-def _best_scores(trials: Sequence[TrialRecord]) -> list[float]:
-    return [trial.score for trial in trials if trial.score is not None]
 
 
 def gradient_health(reading: Reading, name: str, places: Places) -> Picture | None:

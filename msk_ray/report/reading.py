@@ -113,6 +113,11 @@ class Reading:
         return {trial.trial.seed for trial in self.trials}
 
 
+def scores_of(trials: Sequence[TrialRecord]) -> list[float]:
+    """The scores of the trials that have one."""
+    return [trial.score for trial in trials if trial.score is not None]
+
+
 def _without_environment(trials: Sequence[TrialRecord]) -> tuple[TrialRecord, ...]:
     """Trials of one environment, without the parameter that chooses it, unless that parameter sets something else."""
     shared = {key for key in ("env", "env.name") if len({trial.trial.changed.get(key) for trial in trials}) == 1}

@@ -9,7 +9,7 @@ from msk_ray.errors import ConfigError
 from msk_ray.experiment.outcomes import Outcome
 from msk_ray.experiment.records import TrialRecord
 from msk_ray.experiment.snapshot import State
-from msk_ray.report.reading import Reading
+from msk_ray.report.reading import Reading, scores_of
 from msk_ray.report.statistics import Interval, difference_interval, mean_interval
 
 _PLAIN_FIGURES = ("score", "score_std", "length", "fall_rate", "diverged_rate", "best_score")
@@ -116,7 +116,7 @@ def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
     names = outcome_figures(reading.trials)
     rows = []
     for variant, trials in groups.items():
-        scores = _scores(trials)
+        scores = scores_of(trials)
         mean = _mean(scores) if scores else None
         own = variant == baseline
         at, pair = (None, None) if own else _on_equal_terms(trials, reference)
@@ -210,7 +210,3 @@ def outcome_counts(reading: Reading) -> dict[str, int]:
     for trial in reading.trials:
         counts[trial.outcome] = counts.get(trial.outcome, 0) + 1
     return dict(sorted(counts.items(), key=lambda item: -item[1]))
-
-
-def _scores(trials: Sequence[TrialRecord]) -> list[float]:
-    return [trial.score for trial in trials if trial.score is not None]

@@ -16,18 +16,19 @@ from pathlib import Path
 KEEP = b"keep"
 """Message from the driver to keep the folder."""
 _POLL_S = 0.02
+_LIMIT_S = 20.0
+"""Longest time to wait for the end of processes [s]; one may hang in the kernel."""
 
 
-def end_processes(folder: Path, spared: Collection[int], limit_s: float = 20.0) -> None:
+def end_processes(folder: Path, spared: Collection[int]) -> None:
     """Kill all processes of a session folder, and wait until they have ended: those with the folder in their
     environment, and those with a file in it open for writing.
 
     Args:
         folder: Ray's folder.
         spared: processes not to kill.
-        limit_s: longest time to wait [s]; a process may hang in the kernel.
     """
-    deadline = time.monotonic() + limit_s
+    deadline = time.monotonic() + _LIMIT_S
     while time.monotonic() < deadline:
         pids = [pid for pid in _own_processes() if pid not in spared and _belongs(pid, folder)]
         if not pids:

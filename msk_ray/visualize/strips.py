@@ -14,13 +14,13 @@ from msk_ray.visualize.film import grid
 from msk_ray.visualize.render import View, frames
 
 
-def episode_frames(recording: Recording, count: int, view: View, world: int = 0) -> tuple[list[np.ndarray], list[str]]:
-    """`count` frames of one episode at equal times, from its first state to its last, and their times as text.
+def episode_frames(recording: Recording, count: int, view: View) -> tuple[list[np.ndarray], list[str]]:
+    """`count` frames of the first episode at equal times, from its first state to its last, and their times as text.
 
     Raises:
         DeviceError: no OpenGL platform works here.
     """
-    states = recording.world(world)
+    states = recording.world(0)
     indices = _spread(len(states), count)
     return list(frames(states.at(indices), view)), _times(indices, recording)
 

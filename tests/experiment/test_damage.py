@@ -106,7 +106,7 @@ def test_a_file_of_anything_is_read_or_refused_in_one_line(data: bytes) -> None:
             with contextlib.suppress(DamagedFile):
                 load(folder)
         read_ending(folder)
-        seen = read_trial(folder, time.time())
+        seen = read_trial(folder)
         assert seen.folder == folder
         for damage_seen in seen.damages:
             assert "\n" not in str(damage_seen)

@@ -15,6 +15,8 @@ Flags = NDArray[np.bool_]
 
 POINTS = 101
 """Samples of a cycle: one per percent, both ends included."""
+_LOAD = 0.05
+"""Load from which a foot is on the ground, in body weights."""
 
 
 class Stride(NamedTuple):
@@ -36,16 +38,15 @@ class Stride(NamedTuple):
         return (self.toe_off - self.start) / self.samples
 
 
-def on_ground(force: Array, weight: float, *, threshold: float = 0.05, least: int) -> Flags:
+def on_ground(force: Array, weight: float, *, least: int) -> Flags:
     """Whether a foot bears load, shape (T,), from its vertical force (T,) [N].
 
     Args:
         force: ground reaction force of the foot.
         weight: of the body [N].
-        threshold: load from which a foot is on the ground, in body weights.
         least: contacts and gaps shorter than this many samples are chatter and are removed, gaps first.
     """
-    flags = force > threshold * weight
+    flags = force > _LOAD * weight
     for value in (False, True):
         start = 0
         for end in range(1, len(flags) + 1):
