@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -226,6 +227,10 @@ class Env(Task[SettingsT]):
         `self.ground.below(points, reach)`; with the gradient of the slope where rays land.
         """
         return self.measurements.ground
+
+    def tensor(self, values: object) -> Tensor:
+        """A copy of numbers, such as a field of the model, as float32 on the environment's device."""
+        return torch.tensor(np.asarray(values), dtype=torch.float32, device=self.device)
 
     def uniform(self, *shape: int) -> Tensor:
         """Uniform numbers in [-1, 1) from the environment's generator; zeros if resets are not stochastic."""

@@ -4,7 +4,7 @@ from typing import Any, ClassVar, TypeVar
 
 from torch import Tensor
 
-from msk_ray.envs.layout import Entry, entries, vector
+from msk_ray.envs.layout import Entry, each, entries, vector
 from msk_ray.envs.limited_body import LimitedBody
 from msk_ray.envs.limited_settings import FallingSettings
 from msk_ray.step import StepState
@@ -28,8 +28,8 @@ class FloatingBody(LimitedBody[FallingT]):
             *entries(f"torso_quaternion_{axis}" for axis in "wxyz"),
             *vector("torso_velocity", "m/s"),
             *vector("torso_angular_velocity", "rad/s"),
-            *entries((f"{name}_angle" for name in hinges), "rad"),
-            *entries((f"{name}_rate" for name in hinges), "10 rad/s"),
+            *each(hinges, "angle", "rad"),
+            *each(hinges, "rate", "10 rad/s"),
             *entries(self.cosine_names),
             *entries(f"last_action_{i}" for i in range(self.action_size)),
         ]

@@ -17,6 +17,11 @@ def entries(names: Iterable[str], unit: str = "") -> list[Entry]:
     return [Entry(name, unit) for name in names]
 
 
+def each(names: Iterable[str], what: str, unit: str = "") -> list[Entry]:
+    """One entry for each of several things, NAME_WHAT."""
+    return entries((f"{name}_{what}" for name in names), unit)
+
+
 def vector(name: str, unit: str = "") -> list[Entry]:
     """The three entries of a vector in world coordinates."""
     return entries((f"{name}_x", f"{name}_y", f"{name}_z"), unit)

@@ -47,7 +47,7 @@ class LimitedBody(Env[LimitedT]):
         first = int(self.model.jnt_limited.argmax())
         assert self.model.jnt_limited[first:].all(), "joints without a range come first"
         assert (self.model.jnt_type[first:] == int(mujoco.mjtJoint.mjJNT_HINGE)).all()
-        ranges = torch.tensor(self.model.jnt_range[first:], dtype=torch.float32, device=self.device)
+        ranges = self.tensor(self.model.jnt_range[first:])
         low, high = ranges.unbind(-1)
         return int(self.model.jnt_qposadr[first]), low, high
 

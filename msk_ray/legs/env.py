@@ -16,7 +16,7 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.config.physics import CONTACTS
-from msk_ray.envs.layout import Entry, entries
+from msk_ray.envs.layout import Entry, each, entries
 from msk_ray.errors import ConfigError
 from msk_ray.legs.assistance import Assistance, AssistedEnv
 from msk_ray.legs.config import OUT_OF_PLANE, TERMS, AssistConfig, LegSettings
@@ -84,20 +84,20 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
         self.curves = MuscleCurves(self.model, self.device)
         self.action_size = len(self.curves.actuators)
         self.prepare_model()
-        held = torch.tensor(self.model.key("stand").ctrl, dtype=torch.float32, device=self.device)
+        held = self.tensor(self.model.key("stand").ctrl)
         rest = held[self.curves.actuators].clamp_min(_REST_EXCITATION)
         self._odds = (1.0 - rest) / rest
         self.hinge_qpos = columns(self.model.jnt_qposadr[self.hinges], self.device)
         self._hinge_dofs = columns(self.model.jnt_dofadr[self.hinges], self.device)
         with torch.no_grad():
-            stand = torch.tensor(self.model.key("stand").qpos, dtype=torch.float32, device=self.device)[None]
+            stand = self.tensor(self.model.key("stand").qpos)[None]
             still = torch.zeros((1, self.model.nv), device=self.device)
             self.standing_up = self.root(StepState(stand, still, still[:, :0])).up[0]
             # The first three dofs move the pelvis without turning it: what they are for a speed forward, and left.
             units = torch.eye(3, self.model.nv, device=self.device)
             self._slides = self.root(StepState(stand.repeat(3, 1), units, units[:, :0])).velocity.T[:2]
         self.pendulum_time = math.sqrt(self.stand_height / _GRAVITY)
-        ranges = torch.tensor(self.model.jnt_range[self.hinges], dtype=torch.float32, device=self.device)
+        ranges = self.tensor(self.model.jnt_range[self.hinges])
         self.hinge_limits = ranges[:, 0] + _LIMIT_MARGIN, ranges[:, 1] - _LIMIT_MARGIN
         flexions = [self.model.joint(f"hip_flexion_{s}") for s in "rl"]
         self._flexion_dofs = columns([joint.dofadr[0] for joint in flexions], self.device)
@@ -148,9 +148,6 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
 
     def observation_layout(self) -> list[Entry]:
         muscles, hinges = self.action_names(), [self.model.joint(j).name for j in self.hinges]
-
-        def each(names: list[str], what: str, unit: str = "") -> list[Entry]:
-            return entries((f"{name}_{what}" for name in names), unit)
 
         return [
             Entry("pelvis_height", "m"),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.layout import Entry, entries, vector
+from msk_ray.envs.layout import Entry, each, entries, vector
 from msk_ray.envs.memory import Memory
 from msk_ray.envs.mjcf.env import MjcfEnv
 from msk_ray.errors import ConfigError
@@ -114,7 +114,7 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         servos = servos_of(model)
         self.default_pose = self._start.qpos[0, 7:]
         self.action_size = len(servos)
-        self.action_scale = self._tensor(
+        self.action_scale = self.tensor(
             _TORQUE_SHARE * model.actuator_forcerange[servos, 1] / model.actuator_gainprm[servos, 0]
         )
         self._joint_of_servo = torch.tensor(
@@ -122,13 +122,13 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         )
         low, high = model.jnt_range[1:].T
         middle, half = (low + high) / 2.0, _LIMIT_SHARE * (high - low) / 2.0
-        self.joint_limits = self._tensor(middle - half), self._tensor(middle + half)
+        self.joint_limits = self.tensor(middle - half), self.tensor(middle + half)
         spread = self.robot.pose_spread
         self._spreads = torch.tensor(
             [by_joint(values, self.joint_names) for values in (spread.standing, spread.walking, spread.running)],
             device=self.device,
         )
-        self._down = torch.tensor([0.0, 0.0, -1.0], device=self.device)
+        self._down = self.tensor([0.0, 0.0, -1.0])
         self._start_range = _START.to(self.device)
 
     @classmethod
@@ -280,8 +280,8 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
             *vector("imu_velocity", "m/s"),
             *vector("imu_angular_velocity", "rad/s"),
             *vector("gravity"),
-            *entries((f"{joint}_angle" for joint in self.joint_names), "rad"),
-            *entries((f"{joint}_rate" for joint in self.joint_names), "rad/s"),
+            *each(self.joint_names, "angle", "rad"),
+            *each(self.joint_names, "rate", "rad/s"),
             *entries(f"{joint}_action" for joint in self.joint_names),
             *entries(("command_forward", "command_left"), "m/s"),
             Entry("command_yaw_rate", "rad/s"),

@@ -56,11 +56,11 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
 
     def prepare(self) -> None:
         super().prepare()
-        self._middles = self._tensor(Terrain(self.config.terrain_rows).starts)
-        self._shares_up_to = torch.tensor(list(KINDS.values()), device=self.device).cumsum(0)[:-1]
+        self._middles = self.tensor(Terrain(self.config.terrain_rows).starts)
+        self._shares_up_to = self.tensor(list(KINDS.values())).cumsum(0)[:-1]
         self._scanned = grid(1.6, 1.0, 0.1).to(self.device)
         self._fitted = torch.linspace(0, len(self._scanned) - 1, _FITTED, device=self.device).long()
-        self._ahead = torch.tensor([1.0, 0.0, 0.0], device=self.device)
+        self._ahead = self.tensor([1.0, 0.0, 0.0])
 
     # Episodes
 

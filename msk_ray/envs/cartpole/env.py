@@ -31,8 +31,8 @@ class CartPole(Env[CartPoleSettings]):
         return build_cartpole(config, physics)
 
     def prepare(self) -> None:
-        self._hanging = torch.tensor((0.0, math.pi), device=self.device)
-        self._spread = torch.tensor((0.5, math.pi / 2), device=self.device)
+        self._hanging = self.tensor((0.0, math.pi))
+        self._spread = self.tensor((0.5, math.pi / 2))
 
     def draw_physics(self, count: int) -> StepState:
         qpos = self._hanging + self._spread * self.uniform(count, 2)

@@ -48,9 +48,9 @@ class Humanoid(FloatingBody[HumanoidSettings]):
 
     def prepare(self) -> None:
         super().prepare()
-        self._forward = torch.tensor((1.0, 0.0, 0.0), device=self.device)
-        self._target = torch.tensor((_TARGET, 0.0), device=self.device)
-        self._start = torch.tensor((0.0, 0.0, START_HEIGHT), device=self.device)
+        self._forward = self.tensor((1.0, 0.0, 0.0))
+        self._target = self.tensor((_TARGET, 0.0))
+        self._start = self.tensor((0.0, 0.0, START_HEIGHT))
 
     def draw_physics(self, count: int) -> StepState:
         position = self._start + 0.1 * self.uniform(count, 3)

@@ -10,7 +10,6 @@ from typing import ClassVar, Generic, TypeVar
 
 import mujoco
 import numpy as np
-import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
@@ -99,7 +98,7 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
             mujoco.mj_resetDataKeyframe(model, data, 0)
         _check_mocap(data)
         mujoco.mj_normalizeQuat(model, data.qpos)
-        return StepState(*(self._tensor(part)[None] for part in (data.qpos, data.qvel, data.act)))
+        return StepState(*(self.tensor(part)[None] for part in (data.qpos, data.qvel, data.act)))
 
     @cached_property
     def _ranges(self) -> tuple[Tensor, Tensor]:
@@ -113,7 +112,7 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
                 at = model.jnt_qposadr[joint]
                 low, high = model.jnt_range[joint]
                 bounds[:, at] = min(low, start[at]), max(high, start[at])
-        return self._tensor(bounds[0]), self._tensor(bounds[1])
+        return self.tensor(bounds[0]), self.tensor(bounds[1])
 
     def draw_physics(self, count: int) -> StepState:
         qpos, qvel, act = self._start
@@ -133,14 +132,11 @@ class MjcfEnv(Env[AnyMjcfSettings], Generic[AnyMjcfSettings]):
                 f"MJCF, or a method `control` in {type(self).__qualname__}"
             )
         low, high = model.actuator_ctrlrange.T
-        return self._tensor((low + high) / 2.0), self._tensor((high - low) / 2.0)
+        return self.tensor((low + high) / 2.0), self.tensor((high - low) / 2.0)
 
     def control(self, action: Tensor) -> Tensor:
         middle, half = self._control_range
         return middle + half * action
-
-    def _tensor(self, values: np.ndarray) -> Tensor:
-        return torch.as_tensor(np.array(values), dtype=torch.float32, device=self.device)
 
 
 def _check_mocap(data: mujoco.MjData) -> None:

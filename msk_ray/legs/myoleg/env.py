@@ -55,23 +55,23 @@ class MyoLeg(LegEnv[MyoLegSettings]):
         self.stand_height = float(stand[2]) - self._ground
         axes = world_axes(model)
 
-        def tensor(values: object) -> Tensor:
-            return torch.as_tensor(np.asarray(values), dtype=torch.float32, device=self.device)
-
-        self._axes, self._local = tensor(axes), tensor(in_root(model, axes))
-        self._stand = tensor(stand)
-        self._ranges = tuple(tensor(bound) for bound in model.jnt_range[self.hinges].T)
+        self._axes, self._local = self.tensor(axes), self.tensor(in_root(model, axes))
+        self._stand = self.tensor(stand)
+        self._ranges = tuple(self.tensor(bound) for bound in model.jnt_range[self.hinges].T)
         self._dependent, self._driving = (
             columns(couplings.dependent, self.device),
             columns(couplings.driving, self.device),
         )
         self._dependent_dofs = columns(couplings.dependent_dofs, self.device)
         self._driving_dofs = columns(couplings.driving_dofs, self.device)
-        self._reference, self._driving_reference = tensor(couplings.reference), tensor(couplings.driving_reference)
-        self._coefficients = tensor(couplings.coefficients)
+        self._reference, self._driving_reference = (
+            self.tensor(couplings.reference),
+            self.tensor(couplings.driving_reference),
+        )
+        self._coefficients = self.tensor(couplings.coefficients)
 
         if self.config.reset == "cycle":
-            self._cycle = tuple(map(tensor, cycle_states(model, swaying=True)))
+            self._cycle = tuple(map(self.tensor, cycle_states(model, swaying=True)))
         self._springs = FreeSprings(model, axes, self.device)
 
     def applied_force(self, state: StepState) -> Tensor | None:

@@ -43,26 +43,23 @@ class MyoLeg26(LegEnv[MyoLeg26Settings]):
         terrain = Terrain(self.config.terrain)
         self._slope = terrain.slope
         self._plane = not len(terrain.edges)
-        self._edges = self._tensor(terrain.edges)
-        self._levels = self._tensor(terrain.levels)
-        self._ranges = tuple(self._tensor(bound) for bound in model.jnt_range[self.hinges].T)
+        self._edges = self.tensor(terrain.edges)
+        self._levels = self.tensor(terrain.levels)
+        self._ranges = tuple(self.tensor(bound) for bound in model.jnt_range[self.hinges].T)
         names = {"stand": ["stand"], "walk": ["walk_left", "walk_right"]}
         names["mixed"] = names["stand"] + names["walk"]
         names["cycle"] = names["stand"]
         keys = [model.key(name) for name in names[self.config.reset]]
         self._starts = StepState(
-            *(self._tensor([getattr(key, part) for key in keys]) for part in ("qpos", "qvel", "act"))
+            *(self.tensor([getattr(key, part) for key in keys]) for part in ("qpos", "qvel", "act"))
         )
         if self.config.reset == "cycle":
-            self._cycle = StepState(*map(self._tensor, cycle_states(model)))
+            self._cycle = StepState(*map(self.tensor, cycle_states(model)))
         mass = float(model.body_subtreemass[0])
         stiffness, damping = righting()
-        self._springs = self._tensor([0.0, 0.0, LATERAL, *stiffness])
-        self._dampers = self._tensor([0.0, 0.0, 2.0 * math.sqrt(LATERAL * mass), *damping])
-        self._upright_pose = self._tensor(model.key("stand").qpos[:6])
-
-    def _tensor(self, values: object) -> Tensor:
-        return torch.as_tensor(np.array(values), dtype=torch.float32, device=self.device)
+        self._springs = self.tensor([0.0, 0.0, LATERAL, *stiffness])
+        self._dampers = self.tensor([0.0, 0.0, 2.0 * math.sqrt(LATERAL * mass), *damping])
+        self._upright_pose = self.tensor(model.key("stand").qpos[:6])
 
     def control(self, action: Tensor) -> Tensor:
         excitation = super().control(action)

@@ -4,7 +4,6 @@ Axes: W worlds, U muscles.
 """
 
 import math
-from collections.abc import Callable
 from functools import cached_property
 
 import mujoco
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.layout import Entry, entries, vector
+from msk_ray.envs.layout import Entry, each, entries, vector
 from msk_ray.legs.assistance import Assistance, AssistedEnv, FreeSprings
 from msk_ray.legs.clock import fourier
 from msk_ray.legs.config import AssistConfig
@@ -95,23 +94,20 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
         model = self.model
         self.obs_size = model.nq - 2 + model.nv + 2 + 4 + 2 + 1 + 6 + 1 + 4 * model.nu
 
-        def tensor(values: object) -> Tensor:
-            return torch.tensor(np.asarray(values), dtype=torch.float32, device=self.device)
-
         self._muscles = MuscleCurves(model, self.device)
         self._bodies = list(range(1, model.nbody))
-        self._share = tensor(model.body_mass[1:] / model.body_mass[1:].sum())
+        self._share = self.tensor(model.body_mass[1:] / model.body_mass[1:].sum())
         starts = {
             "init": ("right_knee_flexed",),
             "none": ("stand",),
             "random": ("right_knee_flexed", "left_knee_flexed"),
         }
         keys = [model.key(name) for name in starts[self.config.reset]]
-        self._starts = tensor([key.qpos for key in keys]), tensor([key.qvel for key in keys])
-        self.upright = tensor(model.key("stand").qpos[3:7])
+        self._starts = self.tensor([key.qpos for key in keys]), self.tensor([key.qvel for key in keys])
+        self.upright = self.tensor(model.key("stand").qpos[3:7])
         hinges = torch.tensor([model.joint(name).qposadr[0] for name in HINGES], device=self.device)
         self.flexions, self.others = hinges[:2], hinges[2:]
-        self.swing = tensor([-_SWING, _SWING])
+        self.swing = self.tensor([-_SWING, _SWING])
         self._mirror = WalkMirror(model, self.device) if self.config.symmetric else None
         # The phase of people's right leg where MyoSuite's is 0: where the first harmonic of their hip is largest.
         even, odd = fourier(people_angles()[0])[:, 1]
@@ -120,7 +116,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
         self._springs = FreeSprings(model, _AXES, self.device)
         self._starts_in_cycle = self.config.cycle > 0.0 and self.config.stochastic_reset
         if self._starts_in_cycle:
-            self._cycle = self._cycle_starts(tensor)
+            self._cycle = self._cycle_starts()
 
     @cached_property
     def standing_center(self) -> float:
@@ -136,13 +132,13 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
         """The heels and toes."""
         return Feet(self.model, float(self.model.key("stand").qpos[2]), self.device)
 
-    def _cycle_starts(self, tensor: Callable[[object], Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    def _cycle_starts(self) -> tuple[Tensor, Tensor, Tensor]:
         """qpos (N, nq), qvel (N, nv) and steps ahead (N, 1) of starts over the gait cycle."""
         qpos, qvel = cycle_states(self.model)
         qvel /= _PERIOD * self.config.control_timestep
         qvel[:, :3] += SPEED * _AXES[0]
         ahead = np.arange(len(qpos)) / len(qpos) - self.hip_lag
-        return tensor(qpos), tensor(qvel), tensor(np.round(_PERIOD * (ahead % 1.0))[:, None])
+        return self.tensor(qpos), self.tensor(qvel), self.tensor(np.round(_PERIOD * (ahead % 1.0))[:, None])
 
     def draw_start(self, count: int) -> tuple[StepState, Tensor]:
         start, task = super().draw_start(count)
@@ -227,9 +223,6 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
         model = self.model
         joints, muscles = [model.joint(j).name for j in range(1, model.njnt)], self.action_names()
         assert muscles is not None  # the model's actuators are its muscles
-
-        def each(names: list[str], what: str, unit: str = "") -> list[Entry]:
-            return entries((f"{name}_{what}" for name in names), unit)
 
         root = [*vector("root_velocity", "m/s × step"), *vector("root_angular_velocity", "rad/s × step")]
         return [
