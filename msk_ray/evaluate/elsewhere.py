@@ -49,6 +49,8 @@ class ForeignScoring:
     """As `--in` takes it, and its folder."""
     package: str
     """Its name in sentences."""
+    version: str
+    """Its version that has these environments, without the last number."""
     requirement: str
     """What pip installs."""
     summary: str

@@ -28,9 +28,10 @@ class ForeignProcess(AbstractContextManager["ForeignProcess"]):
 
     Attributes:
         hello: what it greeted with.
+        versions: of the packages there, a part of that.
 
     Raises:
-        ConfigError: it ended before it had greeted.
+        ConfigError: it ended before it had greeted, or the package has another version.
     """
 
     def __init__(self, scoring: ForeignScoring, python: Path, script: str, asked: dict[str, Any]) -> None:
@@ -49,6 +50,13 @@ class ForeignProcess(AbstractContextManager["ForeignProcess"]):
             if not line:
                 raise ConfigError(f"--in {self._name}: {self._last_words()}; {scoring.install}")
             self.hello: dict[str, Any] = json.loads(line)
+            self.versions: dict[str, str] = self.hello["versions"]
+            found = self.versions[scoring.name]
+            if not found.startswith(f"{scoring.version}."):
+                raise ConfigError(
+                    f"--in {scoring.name}: {scoring.package} {found} has other tasks than {scoring.version}.x; "
+                    f"{scoring.install}"
+                )
         except BaseException:
             self.__exit__(None, None, None)
             raise

@@ -170,7 +170,7 @@ def test_what_cannot_be_evaluated_there_is_one_line(
         assert run(main, [str(trial), *there]) == 2
     finally:
         _version(place, "2.12.2")
-    assert "MyoSuite 3.0.0 is another task than 2.12.x" in capsys.readouterr().err
+    assert "MyoSuite 3.0.0 has other tasks than 2.12.x" in capsys.readouterr().err
     assert entries(trial) == []
 
 

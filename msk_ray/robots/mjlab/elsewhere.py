@@ -5,6 +5,7 @@ from msk_ray.evaluate.elsewhere import ForeignScoring
 MJLAB = ForeignScoring(
     name="mjlab",
     package="mjlab",
+    version="1.6",
     requirement="mjlab==1.6.0",
     summary="mjlab: a policy of go1_velocity, go1_velocity_rough or g1_velocity in mjlab 1.6's own task, with its "
     "settings for playing, and then with training's pushes and noise; 256 episodes of 20 s on a GPU, 8 on a CPU",

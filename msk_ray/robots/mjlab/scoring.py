@@ -22,7 +22,6 @@ from msk_ray.training import SavedPolicy
 from msk_ray.training.episodes import Episodes
 from msk_ray.training.threads import use_threads
 
-VERSION: Final = "1.6."
 TASKS: Final = {
     "go1_velocity": "Mjlab-Velocity-Flat-Unitree-Go1",
     "go1_velocity_rough": "Mjlab-Velocity-Rough-Unitree-Go1",
@@ -100,7 +99,6 @@ class _Worker(ForeignProcess):
     """A process of mjlab's Python.
 
     Attributes:
-        versions: of the packages there.
         device: it runs on.
         terms: names of the parts of the reward.
     """
@@ -108,14 +106,8 @@ class _Worker(ForeignProcess):
     def __init__(self, python: Path, asked: dict[str, Any]) -> None:
         super().__init__(MJLAB, python, worker.__file__, asked)
         self._asked = asked
-        self.versions: dict[str, str] = self.hello["versions"]
         self.device: str = self.hello["device"]
         self.terms: list[str] = self.hello["terms"]
-        if not self.versions["mjlab"].startswith(VERSION):
-            self.__exit__(None, None, None)
-            raise ConfigError(
-                f"--in mjlab: mjlab {self.versions['mjlab']} has other tasks than {VERSION}x; {MJLAB.install}"
-            )
         self._observations: int = self.hello["observations"]
         self._record = worker.record(self._observations, len(self.terms))
 
