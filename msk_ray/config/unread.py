@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from msk_ray.config.physics import PhysicsConfig
-from msk_ray.config.sections import EnvSettings
 from msk_ray.config.terms import unread_without_weight
 
 if TYPE_CHECKING:
@@ -30,7 +29,8 @@ def unread_settings(config: Config) -> Iterator[tuple[str, str]]:
 
 def _unread(config: Config) -> dict[str, str]:
     env, physics = config.env, config.physics
-    unread = {f"physics.{name}": _while("physics.backward", physics.backward) for name in _unread_by_backward(config)}
+    mode = f"physics.backward is {physics.backward}"
+    unread = {f"physics.{name}": _while(mode) for name in _unread_by_backward(config)}
     if (physics.cone or ("pyramidal" if physics.variant in env.pyramidal_variants else "elliptic")) == "pyramidal":
         why = "nothing reads it while friction cones are pyramids; write physics.cone: elliptic, or"
         unread["physics.solreffriction"] = why
@@ -38,15 +38,12 @@ def _unread(config: Config) -> dict[str, str]:
             unread["curriculum.start.solreffriction"] = why
     alien = [name for name in PhysicsConfig.names() if name not in env.reads_physics]
     unread |= {f"physics.{name}": f"env {env.name} does not read it;" for name in alien}
-    unread |= {f"env.{name}": f"nothing reads it while {why};" for name, why in _unread_of(env).items()}
+    own = env.unread() | unread_without_weight(env)
+    unread |= {f"env.{name}": _while(why) for name, why in own.items()}
     section = config.algorithm_section
     own = config.algorithm_settings.unread()
-    unread |= {f"{section}.{name}": f"nothing reads it while {section}.{why};" for name, why in own.items()}
+    unread |= {f"{section}.{name}": _while(f"{section}.{why}") for name, why in own.items()}
     return unread
-
-
-def _unread_of(env: EnvSettings) -> dict[str, str]:
-    return env.unread() | unread_without_weight(env)
 
 
 def _unread_by_backward(config: Config) -> list[str]:
@@ -61,5 +58,5 @@ def _unread_by_backward(config: Config) -> list[str]:
             return [*state, "fd.eps_ctrl"]
 
 
-def _while(key: str, value: str) -> str:
-    return f"nothing reads it while {key} is {value};"
+def _while(why: str) -> str:
+    return f"nothing reads it while {why};"

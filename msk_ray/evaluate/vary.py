@@ -45,11 +45,6 @@ def _at(name: str, value: str) -> RandomizeConfig:
         raise ConfigError(f"--vary {name}: only multiples of the model's own; write {number:g}x") from None
 
 
-def share_of_own(own: float, score: float) -> str:
-    """A score as a share of the score with the unchanged model."""
-    return f"{score / own:.0%}" if own > 0.0 else "-"
-
-
 def vary_text(entries: Sequence[dict[str, Any]]) -> str:
     """Evaluations with the unchanged model and with other values, for a terminal.
 
@@ -62,7 +57,7 @@ def vary_text(entries: Sequence[dict[str, Any]]) -> str:
             entry["physics"],
             f"{entry['score']['mean']:.5g}",
             f"{entry['score']['std']:.3g}",
-            share_of_own(own, entry["score"]["mean"]),
+            f"{entry['score']['mean'] / own:.0%}" if own > 0.0 else "-",
             f"{entry['length']['mean']:.0f}",
             f"{entry['fall_rate']:.0%}",
         )
