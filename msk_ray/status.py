@@ -16,7 +16,7 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.records import (
     ExperimentReader,
     TrialRecord,
-    counts,
+    count_states,
     describe_bests,
     find_experiments,
     in_order,
@@ -135,7 +135,7 @@ def view(reader: ExperimentReader, width: int, rows: int | None = None) -> "Rend
 def headline(experiment: Experiment, records: Sequence[TrialRecord]) -> str:
     """`ant_lr · 2 running · 3 ended · best 12.3 (1a2b3c4d) · at most 2h05m left`; with several environments, the best
     of each."""
-    parts = [experiment.name, *(f"{n} {state}" for state, n in counts(records).items())]
+    parts = [experiment.name, *count_states(records)]
     if best := describe_bests(records, ids=True):
         parts.append(f"best {best}")
     left = remaining(records)
@@ -269,7 +269,7 @@ def _summary(experiment: Experiment) -> tuple[str, str, str, str]:
         question = experiment.manifest().get("question") or ""
     except MskRayError as error:
         return "-", "-", printable(str(error)), ""
-    states = ", ".join(f"{n} {state}" for state, n in counts(records).items()) or "no trial has started yet"
+    states = ", ".join(count_states(records)) or "no trial has started yet"
     bests = printable(describe_bests(records, ids=False)).replace(", ", "\n")
     return str(len(records)), bests or "-", states, printable(question)
 

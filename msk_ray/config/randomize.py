@@ -178,11 +178,6 @@ class RandomizeConfig(ModelRandomization):
         """Distributions of fields of the model, by field."""
         return {name: value for name, value in self._written.items() if isinstance(value, Draw | Payload | Shift)}
 
-    @property
-    def disturbs(self) -> bool:
-        """Whether there is anything but parameters of the model."""
-        return len(self.parameters) < len(self._written)
-
     def __str__(self) -> str:
         return ", ".join(f"{name} {_text(name, value)}" for name, value in self._written.items())
 

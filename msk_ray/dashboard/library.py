@@ -19,7 +19,7 @@ from msk_ray.dashboard.plots import can_plot, figures
 from msk_ray.errors import ConfigError, MskRayError, StorageError
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
-from msk_ray.experiment.records import ExperimentReader, counts, describe_bests, find_experiments
+from msk_ray.experiment.records import ExperimentReader, count_states, describe_bests, find_experiments
 from msk_ray.experiment.snapshot import file_stamp
 from msk_ray.experiment.trainings import TrainingReader
 from msk_ray.files import UnusableFile, open_file
@@ -271,7 +271,7 @@ class Library:
                 rows.append((path.name, "", "", explain(error), ""))
                 continue
             score = describe_bests(records, ids=False)
-            state = ", ".join(f"{n} {state}" for state, n in counts(records).items()) or "no trial has started yet"
+            state = ", ".join(count_states(records)) or "no trial has started yet"
             rows.append((path.name, str(len(records)), score, state, question))
         return rows
 

@@ -152,9 +152,9 @@ def in_order(records: Sequence[TrialRecord]) -> list[TrialRecord]:
     return sorted(records, key=rank)
 
 
-def counts(records: Sequence[TrialRecord]) -> dict[State, int]:
-    """Number of trials in each state; states without trials are omitted."""
-    return {state: n for state in State if (n := sum(record.state is state for record in records))}
+def count_states(records: Sequence[TrialRecord]) -> list[str]:
+    """`3 running` and the like, for each state that trials have."""
+    return [f"{n} {state}" for state in State if (n := sum(record.state is state for record in records))]
 
 
 def describe_bests(records: Sequence[TrialRecord], *, ids: bool) -> str:

@@ -2,6 +2,7 @@
 
 import math
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -206,7 +207,4 @@ def failures(reading: Reading) -> list[tuple[str, str, list[TrialRecord]]]:
 
 def outcome_counts(reading: Reading) -> dict[str, int]:
     """How many trials have each outcome or state; the most frequent first."""
-    counts: dict[str, int] = {}
-    for trial in reading.trials:
-        counts[trial.outcome] = counts.get(trial.outcome, 0) + 1
-    return dict(sorted(counts.items(), key=lambda item: -item[1]))
+    return dict(Counter(trial.outcome for trial in reading.trials).most_common())
