@@ -34,8 +34,8 @@ SECONDS = 0.5
 
 
 POLICIES = sorted(SHIPPED.glob("*.pt"))
-ALWAYS = ("ant_hard", "cartpole", "myoleg26")
-"""One of each kind: with contacts, without, with muscles."""
+ALWAYS = ("ant_hard", "cartpole", "go1_velocity", "myoleg26")
+"""One of each kind: with contacts, without, with commands and a memory, with muscles."""
 
 
 @pytest.mark.parametrize(
