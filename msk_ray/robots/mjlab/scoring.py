@@ -127,7 +127,7 @@ class _Worker(ForeignProcess):
             ended = running & step["terminated"]
             for name, total in sums.items():
                 # A world that fell is elsewhere already when errors are measured.
-                counted = running & ~ended if name in _ERRORS else running
+                counted = running & ~ended if name in worker.ERRORS else running
                 total[counted] += step[name][counted]
             fell |= ended
             running &= ~ended
@@ -138,10 +138,9 @@ class _Worker(ForeignProcess):
             fell=torch.from_numpy(fell),
             diverged=torch.from_numpy(~np.isfinite(sums["reward"])),
             terms=torch.from_numpy(sums["terms"]),
-            outcomes={name: torch.from_numpy(sums[name]) for name in _ERRORS},
+            outcomes={name: torch.from_numpy(sums[name]) for name in worker.ERRORS},
             success=None,
         )
 
 
-_ERRORS: Final = ("linear_error", "yaw_error")
-_SUMMED: Final = ("reward", "terms", *_ERRORS)
+_SUMMED: Final = ("reward", "terms", *worker.ERRORS)

@@ -14,6 +14,7 @@ import sys
 import numpy as np
 
 PACKAGES = ("mjlab", "mujoco", "mujoco-warp", "torch")
+ERRORS = ("linear_error", "yaw_error")
 
 
 def record(observations: int, terms: int) -> np.dtype:
@@ -30,26 +31,19 @@ def record(observations: int, terms: int) -> np.dtype:
     )
 
 
-def main() -> None:
-    """Run the steps that the argument asks for; worlds that fall begin another episode."""
-    asked = json.loads(sys.argv[1])
-    answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # mjlab prints
-    os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is drawn
-
+def task_for_scoring(task: str, pushed: bool, worlds: int, seed: int, device: str):  # type: ignore[no-untyped-def]
+    """The environment of a task with mjlab's settings for playing, or with training's pushes and noise besides; and the
+    distances from the command, which are filled in each step."""
     import torch
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.tasks.registry import load_env_cfg
 
-    worlds = asked["worlds"]
-    cfg = load_env_cfg(asked["task"], play=True)
-    if asked["pushed"]:
-        cfg.events["push_robot"] = load_env_cfg(asked["task"]).events["push_robot"]
+    cfg = load_env_cfg(task, play=True)
+    if pushed:
+        cfg.events["push_robot"] = load_env_cfg(task).events["push_robot"]
         cfg.observations["actor"].enable_corruption = True
-    cfg.scene.num_envs, cfg.seed = worlds, asked["seed"]
-    device = "cuda:0" if torch.cuda.is_available() else "cpu"
+    cfg.scene.num_envs, cfg.seed = worlds, seed
     env = ManagerBasedRlEnv(cfg, device)
-    obs, _ = env.reset()
     robot, command = env.scene["robot"].data, env.command_manager.get_term("twist")
     errors: dict[str, torch.Tensor] = {}
     update = command.compute
@@ -62,6 +56,22 @@ def main() -> None:
         update(*given, **named)
 
     command.compute = compute
+    return env, errors
+
+
+def main() -> None:
+    """Run the steps that the argument asks for; worlds that fall begin another episode."""
+    asked = json.loads(sys.argv[1])
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # mjlab prints
+    os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is drawn
+
+    import torch
+
+    worlds = asked["worlds"]
+    device = "cuda:0" if torch.cuda.is_available() else "cpu"
+    env, errors = task_for_scoring(asked["task"], asked["pushed"], worlds, asked["seed"], device)
+    obs, _ = env.reset()
     terms = env.reward_manager.active_terms
     observations, actions = obs["actor"].shape[1], env.action_manager.total_action_dim
     hello = {
