@@ -14,6 +14,7 @@ from msk_ray.compiling import announce_compiling
 from msk_ray.config import Config, load_config, parse_config
 from msk_ray.errors import ConfigError, DeviceError
 from msk_ray.evaluate.targets import REFERENCE, best_checkpoint, find_target
+from msk_ray.play import NO_DISPLAY
 from msk_ray.shipped import POLICIES, find_shipped
 from msk_ray.sweep.space import parse_seeds
 from msk_ray.tasks import Task, find_task
@@ -140,9 +141,7 @@ def _check(args: argparse.Namespace) -> None:
         if find_spec("mjviser") is None:
             raise ConfigError("--browser needs mjviser: pip install 'msk-ray[browser]'")
     elif sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise DeviceError(
-            "there is no display: add --browser (pip install 'msk-ray[browser]'), or make a film with msk-ray visualize"
-        )
+        raise DeviceError(NO_DISPLAY)
 
 
 def _checkpoint(args: argparse.Namespace, task: Task | None) -> Path | None:

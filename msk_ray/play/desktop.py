@@ -1,13 +1,18 @@
 """MuJoCo's own window on the desktop."""
 
+import sys
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+import glfw
 import mujoco
 import mujoco.viewer
 from torch import Tensor
 
+from msk_ray.errors import DeviceError
+from msk_ray.play import NO_DISPLAY
 from msk_ray.play.screen import Screen
 from msk_ray.step import StepState
 from msk_ray.visualize.look import default_camera
@@ -45,7 +50,12 @@ class Desktop(Screen):
 
 @contextmanager
 def desktop(model: mujoco.MjModel, groups: Sequence[int]) -> Iterator[Desktop]:
-    """A window, whose thread has ended when the block is left. Says how to end it."""
+    """A window, whose thread has ended when the block is left. Says how to end it.
+
+    Raises:
+        DeviceError: no window can be opened; MuJoCo's viewer would end the process.
+    """
+    _check_display()
     before = set(threading.enumerate())
     screen = Desktop(model, groups)
     print("close the window to end", flush=True)
@@ -56,3 +66,14 @@ def desktop(model: mujoco.MjModel, groups: Sequence[int]) -> Iterator[Desktop]:
         # The interpreter must not exit while a thread is still closing OpenGL.
         for thread in set(threading.enumerate()) - before:
             thread.join(timeout=10.0)
+
+
+def _check_display() -> None:
+    if sys.platform != "linux":  # elsewhere a display is there, and mjpython has begun GLFW
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", glfw.GLFWError)
+        opens = glfw.init()
+    if not opens:
+        raise DeviceError(NO_DISPLAY)
+    glfw.terminate()  # the viewer begins and ends GLFW itself

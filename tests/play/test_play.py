@@ -19,7 +19,7 @@ from torch import Tensor
 from msk_ray.__main__ import main
 from msk_ray.config import load_config
 from msk_ray.envs import Env, make_env
-from msk_ray.errors import ConfigError
+from msk_ray.errors import ConfigError, DeviceError
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.play.agents import random_policy, zero_policy
 from msk_ray.play.episodes import play_episodes
@@ -123,6 +123,15 @@ def test_what_cannot_work_is_said_in_one_line(
     assert main(["play", *arguments]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_a_display_that_does_not_open_is_no_display(env: Env, monkeypatch: pytest.MonkeyPatch) -> None:
+    from msk_ray.play.desktop import desktop
+
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":98765")
+    with pytest.raises(DeviceError, match="there is no display: add --browser"), desktop(env.model, (0,)):
+        pass
 
 
 @pytest.mark.parametrize(
