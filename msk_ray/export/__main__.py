@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from msk_ray.cli import STORAGE, Parser, run
+from msk_ray.compiling import announce_compiling
 from msk_ray.config.packages import require
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import REFERENCE, best_checkpoint, find_target
 from msk_ray.export.formats import FORMATS
 from msk_ray.files import make_folder
-from msk_ray.progress import announce
 from msk_ray.sweep.space import parse_seeds
 
 DESCRIPTION = """\
@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise ConfigError(f"--{given[0]}: only --zoo reads it; leave it out")
     _check_paths(paths, checkpoint)
     # torch and Warp take seconds to load; a wrong command line should not wait for them.
-    announce(f"exporting {checkpoint}")
+    announce_compiling(f"exporting {checkpoint}")
     from msk_ray.export.write import export
 
     for line in export(checkpoint, paths, args.physics or REFERENCE):

@@ -50,7 +50,12 @@ def parser() -> Parser:
     p.add_argument("target", nargs="?", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="what to draw")
     output = p.add_argument_group("what to make")
     output.add_argument("--no-render", action="store_true", help="print statistics of the episodes, draw nothing")
-    output.add_argument("--video", type=Path, metavar="FILE", help="an .mp4, .mkv, .mov or .gif")
+    output.add_argument(
+        "--video",
+        type=Path,
+        metavar="FILE",
+        help="an .mp4, .mkv, .mov or .gif; drawing takes long without a GPU: see --steps, --fps, --size",
+    )
     output.add_argument("--save-frames", type=Path, metavar="DIR", help="numbered .png files")
     output.add_argument("--strip", type=Path, metavar="FILE", help="frames side by side, evenly spaced over an episode")
     output.add_argument(
@@ -245,7 +250,7 @@ def _film(recording: "Recording", fps: float, view: "View") -> Iterator["np.ndar
 
     episodes = [recording.frames_at(world, fps) for world in range(recording.count)]
     total = sum(len(states) for states in episodes)
-    announce(f"drawing {total} frames of {view.width}x{view.height}")
+    announce(f"drawing {total} frames of {view.width}x{view.height} (fewer: --steps, --fps; smaller: --size)")
     pace = Pace("frames", total)
     for done, frame in enumerate((frame for states in episodes for frame in frames(states, view)), 1):
         yield frame

@@ -94,7 +94,7 @@ def test_video_and_strip(target: Path, tmp_path: Path, drawing: str, capsys: pyt
     assert np.ptp(left) > 50
     assert not np.array_equal(left, right)
     said = capsys.readouterr().out
-    assert f"drawing {len(shots)} frames of 160x120 ..." in said
+    assert f"drawing {len(shots)} frames of 160x120 (fewer: --steps, --fps; smaller: --size) ..." in said
     assert f"{len(shots)} frames in {video}" in said
 
 
