@@ -13,6 +13,7 @@ if __name__ == "__main__":
 import argparse
 import math
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -65,7 +66,12 @@ def parser() -> Parser:
     p.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=SET_HELP)
     p.add_argument("--seed", type=int, help="same as --set trial.seed=N")
     p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
-    p.add_argument("--logdir", type=Path, metavar="DIR", help="log folder (default: runs/train/CONFIG_seedN)")
+    p.add_argument(
+        "--logdir",
+        type=Path,
+        metavar="DIR",
+        help="log folder (default: runs/train/CONFIG_seedN, with --set env.name=.. CONFIG_ENV_seedN)",
+    )
     p.add_argument(
         "--resume", action="store_true", help="continue from the newest complete checkpoint in the log folder"
     )
@@ -88,7 +94,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     overrides = [*args.overrides, *([] if args.seed is None else [f"trial.seed={args.seed}"])]
     config = load_config(args.config, overrides)
     config.check_installed()
-    logdir = args.logdir or Path("runs") / "train" / f"{args.config.stem}_seed{config.trial.seed}"
+    logdir = args.logdir or Path("runs") / "train" / _folder_name(args.config.stem, config, args.overrides)
     _check_logdir(logdir, args.resume)
     logdir = logdir.resolve()
     words = sys.argv if argv is None else [__file__, *argv]
@@ -105,6 +111,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             command = typed_command(words, *(["--resume"] if begun else []))
             print(f"stopped by {stop.signal.name}; continue with: {printable(command)}")
             return RESUMABLE
+
+
+def _folder_name(stem: str, config: Config, overrides: Sequence[str]) -> str:
+    """Of the default log folder: the config file, the environment if --set chooses it, the seed."""
+    changed = any(text.partition("=")[0].strip() == "env.name" for text in overrides)
+    env = f"_{re.split('[.:]', config.env.name)[-1]}" if changed else ""
+    return f"{stem}{env}_seed{config.trial.seed}"
 
 
 def _check_logdir(logdir: Path, resume: bool) -> None:
@@ -173,6 +186,8 @@ def train(
     if not isinstance(config, Config):
         raise ConfigError(f"config must be a Config, not {type(config).__name__}: write msk_ray.load_config(...)")
     config.check_installed()
+    for line in config.unfinished:
+        warnings.warn(line, stacklevel=2)
     folder = Path(logdir)
     _check_logdir(folder, resume)
     with owned(folder.resolve(), force) as ownership:
@@ -230,6 +245,8 @@ def _train(
     print(
         f"{config.env.name}: {config.trial.epochs} epochs, {config.env.nworld} worlds; log folder {logdir}", flush=True
     )
+    for line in config.unfinished:
+        print(line)
     device = _choose_device(args.device)
     gpus = config.execution.gpus
     place = device if gpus == 1 else f"{gpus} {'CPU processes' if device == 'cpu' else f'GPUs, the first {device}'}"
@@ -244,6 +261,8 @@ def _train(
         print(f"constraint solver: {trainer.solver()}")
     if trainer.together > 1:
         print(f"policies are scored {trainer.together} at a time, after two minutes at most (or --score-at-once)")
+    elif trainer.epoch == 0:
+        announce(f"scoring the first policy in {config.evaluation.nworld} worlds, then training")
     progress = ProgressLine(config.trial.epochs)
     # Loggers flush their rows in any case.
     with stop.deferred(), closing(trainer):
@@ -266,7 +285,10 @@ def _train(
         return RESUMABLE
     if math.isfinite(trainer.best_score):
         untrained = _untrained_score(logdir)
-        print(f"best evaluation score {trainer.best_score:.1f}{untrained}: {trainer.best_checkpoint}")
+        beside = "" if untrained is None else f" (untrained {untrained:.1f})"
+        print(f"best evaluation score {trainer.best_score:.1f}{beside}: {trainer.best_checkpoint}")
+        if untrained is not None and untrained >= trainer.best_score:
+            print("no trained policy scored higher than the first one: by this score, nothing was learned")
     else:
         print(f"no evaluation gave a score; {trainer.best_checkpoint} is the untrained policy")
     print(f"metrics: {logdir / 'metrics.jsonl'}; curves: tensorboard --logdir {logdir}")
@@ -281,10 +303,10 @@ def _waiting(logdir: Path) -> str:
     return "" if not count else "1 policy" if count == 1 else f"{count} policies"
 
 
-def _untrained_score(logdir: Path) -> str:
-    """Text on the untrained policy's score; empty if it was not evaluated."""
+def _untrained_score(logdir: Path) -> float | None:
+    """The untrained policy's score; None if it was not evaluated."""
     first = next(iter(read_rows(logdir)), {})
-    return f" (untrained {first[SCORE]:.1f})" if first.get("epoch") == 0 and SCORE in first else ""
+    return first.get(SCORE) if first.get("epoch") == 0 else None
 
 
 class _CallableModule(ModuleType):

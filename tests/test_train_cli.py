@@ -11,6 +11,7 @@ from msk_ray.config import dump_yaml
 from msk_ray.errors import DeviceError
 from msk_ray.experiment.metrics import read_metrics
 from msk_ray.train import main
+from msk_ray.training import Evaluator
 
 pytestmark = pytest.mark.long
 
@@ -64,6 +65,27 @@ def test_what_made_it_slow_is_said_to_the_end(
         "cannot be recorded (it waits)"
     )
     assert read_metrics(tmp_path / "out" / "metrics.jsonl")[-1]["train/unrecordable"] == 1.0
+
+
+def test_what_is_waited_for_and_what_was_not_learned_is_said(
+    tiny_settings: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Here training makes it worse: 10 untrained, then 9."""
+    scores = iter((10.0, 9.0))
+    monkeypatch.setattr(Evaluator, "run", lambda self, policies: [{"score": next(scores)}])
+    tiny_settings["trial"] |= {"epochs": 2}
+    tiny_settings["execution"] |= {"loggers": []}
+    tiny_settings["shac"]["horizon"] = {"kind": "schedule", "start": 8, "end": 16, "epochs": 20}
+    (tmp_path / "tiny.yaml").write_text(dump_yaml(tiny_settings))
+    words = ["--config", str(tmp_path / "tiny.yaml"), "--logdir", str(tmp_path / "out"), "--device", "cpu"]
+    assert run(main, words) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == (
+        "shac.horizon.epochs is epoch 20, but training ends at trial.epochs, 2: the schedule stays unfinished"
+    )
+    assert "scoring the first policy in 4 worlds, then training ..." in lines
+    assert lines[-3].startswith("best evaluation score 9.0 (untrained 10.0): ")
+    assert lines[-2].startswith("no trained policy scored higher than the first one")
 
 
 def test_a_folder_that_holds_a_trial_is_left_alone(

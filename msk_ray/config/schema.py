@@ -16,15 +16,18 @@ from msk_ray.config.algorithms import (
     BUILT_IN,
     AlgorithmConfig,
     AlgorithmSettings,
+    ExplorationSchedule,
     PpoConfig,
     ShacConfig,
     ignored_settings,
 )
 from msk_ray.config.environments import UndeclaredEnv, settings_class
 from msk_ray.config.execution import ExecutionConfig
+from msk_ray.config.horizons import HorizonSchedule
 from msk_ray.config.loggers import logger_paths
 from msk_ray.config.packages import require
 from msk_ray.config.physics import PhysicsConfig
+from msk_ray.config.schedules import CostSchedule
 from msk_ray.config.sections import SHOWN, Count, EnvSettings, Section, Text, Undeclared, Whole
 from msk_ray.config.unread import unread_settings
 from msk_ray.errors import ConfigError, brief
@@ -157,6 +160,22 @@ class Config(Section):
     def algorithm_section(self) -> str:
         """The dotted section of these settings."""
         return self.algorithm.name if self.algorithm.name in BUILT_IN else "algorithm.settings"
+
+    @property
+    def unfinished(self) -> list[str]:
+        """A line for each schedule that training ends before. No error, because epochs can be added to a trial."""
+        ends = {f"env.{name}.end": value.end for name, value in self.env if isinstance(value, CostSchedule)}
+        if self.curriculum is not None:
+            ends["curriculum.epochs"] = self.curriculum.epochs
+        for name, value in self.algorithm_settings:
+            if isinstance(value, HorizonSchedule | ExplorationSchedule):
+                ends[f"{self.algorithm_section}.{name}.epochs"] = value.epochs
+        last = self.trial.epochs
+        return [
+            f"{key} is epoch {end}, but training ends at trial.epochs, {last}: the schedule stays unfinished"
+            for key, end in ends.items()
+            if end > last
+        ]
 
     @property
     def undeclared(self) -> str:

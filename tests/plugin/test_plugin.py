@@ -165,5 +165,5 @@ def test_installed_as_a_wheel_it_has_a_short_name(
     misspelt = here("train", "--config", "hopper.yaml", "--set", "env.name=sprngy")
     assert (misspelt.returncode, "did you mean 'springy'?" in misspelt.stdout) == (2, True), misspelt.stdout
     _done(here("train", "--config", "hopper.yaml", "--device", "cpu", "--set", "env.name=springy"))
-    rows = (place / "runs" / "train" / "hopper_seed0" / "metrics.jsonl").read_text().splitlines()
+    rows = (place / "runs" / "train" / "hopper_springy_seed0" / "metrics.jsonl").read_text().splitlines()
     assert len(rows) == 3  # the untrained policy, and two epochs
