@@ -40,6 +40,8 @@ class VelocityShape(Reward):
     tail: Fraction = 0.0
     """Share of 1/(1 + x) in the terms `track_linear_velocity` and `track_angular_velocity`, which are e^−x in scores:
     that has no slope far from the command. For training."""
+    pose_tail: Fraction = 0.0
+    """The same share in `pose` and `upright`, which have no slope far from the default pose. For training."""
 
 
 def velocity_terms(*others: Term) -> tuple[Term, ...]:

@@ -29,9 +29,8 @@ _COLLISION_FORCE = 10.0
 """Force from which a collision counts [N]."""
 
 
-def _closeness(env: Robots, error: Tensor, variance: float) -> Tensor:
-    """e^−x for x = error / variance, and with `env.reward.tail`, in training, a share of 1/(1 + x)."""
-    relative, tail = error / variance, env.config.reward.tail
+def _closeness(relative: Tensor, tail: float) -> Tensor:
+    """e^−x, and for `tail` > 0, in training, a share of 1/(1 + x)."""
     close = torch.exp(-relative)
     return close if tail == 0.0 else torch.lerp(close, 1.0 / (1.0 + relative), tail)
 
@@ -43,7 +42,7 @@ def track_linear_velocity(env: Robots, state: StepState, action: Tensor, obs: Te
     """
     velocity, _ = env.base_velocities(state)
     error = (env.velocity_command()[:, :2] - velocity[:, :2]).square().sum(-1) + velocity[:, 2].square()
-    return _closeness(env, error, 0.25)
+    return _closeness(error / 0.25, env.config.reward.tail)
 
 
 def track_angular_velocity(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -53,24 +52,27 @@ def track_angular_velocity(env: Robots, state: StepState, action: Tensor, obs: T
     """
     _, spin = env.base_velocities(state)
     error = (env.velocity_command()[:, 2] - spin[:, 2]).square() + spin[:, :2].square().sum(-1)
-    return _closeness(env, error, 0.5)
+    return _closeness(error / 0.5, env.config.reward.tail)
 
 
 def upright(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """exp(−s² / 0.2), where s is the sine of the trunk's tilt."""
+    """exp(−s² / 0.2), where s is the sine of the trunk's tilt. In training, `env.reward.pose_tail` gives it a slope."""
     tilt = env.gravity_in(state, env.robot.trunk)[:, :2].square().sum(-1)
-    return torch.exp(-tilt / 0.2)
+    return _closeness(tilt / 0.2, env.config.reward.pose_tail)
 
 
 def upright_on_ground(env: "Go1VelocityRough", state: StepState, action: Tensor, obs: Tensor) -> Tensor:
     """exp(−s² / 0.2), where s is the sine of the trunk's tilt to the ground around it."""
-    return torch.exp(-env.tilt_to_ground(state) / 0.2)
+    return _closeness(env.tilt_to_ground(state) / 0.2, env.config.reward.pose_tail)
 
 
 def variable_posture(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """exp(−mean (distance from the default pose / spread)²), where the spread of each joint depends on the command."""
+    """exp(−mean (distance from the default pose / spread)²), where the spread of each joint depends on the command.
+
+    In training, `env.reward.pose_tail` gives it a slope far from that pose.
+    """
     distance = (state.qpos[:, 7:] - env.default_pose) / env.pose_spread()
-    return torch.exp(-distance.square().mean(-1))
+    return _closeness(distance.square().mean(-1), env.config.reward.pose_tail)
 
 
 def body_ang_vel(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:

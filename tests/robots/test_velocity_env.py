@@ -18,6 +18,7 @@ from msk_ray.robots.config import G1_TERMS
 from msk_ray.robots.env import VelocityEnv, servos_of
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1
+from msk_ray.robots.terms import upright, variable_posture
 from msk_ray.step import StepState
 
 SCENES = Path(__file__).parents[2] / "msk_ray" / "robots" / "scenes"
@@ -87,6 +88,20 @@ def test_a_tail_is_part_of_training_alone() -> None:
     assert still < 1e-4
     assert close == pytest.approx(2.0 * 0.5 / (1.0 + 4.0 / 0.25), rel=0.5)
     assert type(tailed).reference_settings(tailed.config).reward.tail == 0.0
+
+
+def test_a_tail_of_the_pose_gives_it_a_slope_far_away() -> None:
+    """Every joint is three spreads away, the trunk lies on its side: x is 9, and 1 / 0.2."""
+    plain, tailed = make(1), make(1, reward={"pose_tail": 0.25})
+    for env, share in ((plain, 0.0), (tailed, 0.25)):
+        end = env.state.physics
+        joints = env.default_pose + 3.0 * env.pose_spread()
+        lying = torch.tensor([[0.5**0.5, 0.5**0.5, 0.0, 0.0]])
+        end = end._replace(qpos=torch.cat((end.qpos[:, :3], lying, joints), dim=-1))
+        for term, x in ((variable_posture, 9.0), (upright, 5.0)):
+            value = term(env, end, end.qpos, end.qpos).item()
+            assert value == pytest.approx((1.0 - share) * math.exp(-x) + share / (1.0 + x), rel=1e-4)
+    assert type(tailed).reference_settings(tailed.config).reward.pose_tail == 0.0
 
 
 def test_costs_rise_in_training_alone() -> None:
