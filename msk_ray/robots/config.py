@@ -73,6 +73,9 @@ class VelocitySettings(MjcfSettings):
     action_range: PositiveFloat = 1.0
     """mjlab's action for an action of 1 of the policy. mjlab's are not bounded; 1 asks a joint for an angle that its
     servo, standing still, holds with a quarter of its largest torque."""
+    fall_height: Fraction = 0.0
+    """In training, episodes also end when the base is lower than this share of its default height; 0: they do not. A
+    robot that has sunk into a crouch seldom finds a way out of it. Not in scores."""
     cost_schedule: CostSchedule | None = None
     """Factor on the weights of costs in training, all but `dof_pos_limits`; null: 1."""
     reward: VelocityShape = VelocityShape()

@@ -151,8 +151,21 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         orientation = quat_multiply(turn, start.qpos[:, 3:7])
         return start._replace(qpos=torch.cat((position, orientation, start.qpos[:, 7:]), dim=-1))
 
+    @classmethod
+    def reference_settings(cls, config: AnyVelocitySettings) -> AnyVelocitySettings:
+        return super().reference_settings(config).model_copy(update={"fall_height": 0.0})
+
     def fell(self, state: StepState) -> Tensor:
-        return self.frames(state).axis(self.robot.base, 2)[:, 2] < math.cos(_FALLEN)
+        fallen = self.frames(state).axis(self.robot.base, 2)[:, 2] < math.cos(_FALLEN)
+        return fallen | self.is_low(state) if self.config.fall_height > 0.0 else fallen
+
+    def is_low(self, state: StepState) -> Tensor:
+        """Whether the base is lower than `env.fall_height` allows, (W,) bool."""
+        return self.base_height(state) < self.config.fall_height * self._start.qpos[0, 2]
+
+    def base_height(self, state: StepState) -> Tensor:
+        """Height of the base above the ground [m], (W,)."""
+        return state.qpos[:, 2]
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
         """`linear_error` [m/s] and `yaw_error` [rad/s] are distances of the base's velocities from the command."""

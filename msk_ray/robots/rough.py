@@ -71,7 +71,11 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
         return start._replace(qpos=torch.cat((start.qpos[:, :3] + middle, start.qpos[:, 3:]), dim=-1))
 
     def fell(self, state: StepState) -> Tensor:
-        return self.hits(state, self.thighs) > 0
+        hit = self.hits(state, self.thighs) > 0
+        return hit | self.is_low(state) if self.config.fall_height > 0.0 else hit
+
+    def base_height(self, state: StepState) -> Tensor:
+        return self.ground.below(state.qpos[:, None, :3], _REACH)[:, 0]
 
     # What terms and observation use
 

@@ -18,6 +18,7 @@ from msk_ray.robots.config import G1_TERMS
 from msk_ray.robots.env import VelocityEnv, servos_of
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1
+from msk_ray.robots.rough import Go1VelocityRough
 from msk_ray.robots.terms import upright, variable_posture
 from msk_ray.step import StepState
 
@@ -29,6 +30,14 @@ def make(nworld: int, robot: str = "go1", *, differentiable: bool = False, **cha
     settings = settings_class(name)(name=name, **changes)
     env = make_env(settings, PhysicsConfig(), nworld, "cpu", 0, differentiable=differentiable)
     assert isinstance(env, VelocityEnv)
+    return env
+
+
+def make_rough(nworld: int, **changes: Any) -> Go1VelocityRough:
+    name = "go1_velocity_rough"
+    settings = settings_class(name)(name=name, terrain_rows=2, **changes)
+    env = make_env(settings, PhysicsConfig(), nworld, "cpu", 0, differentiable=False)
+    assert isinstance(env, Go1VelocityRough)
     return env
 
 
@@ -200,3 +209,24 @@ def test_a_model_whose_joints_cannot_be_moved_is_refused(joint: str, servo: str,
     )
     with pytest.raises(ConfigError, match=message):
         servos_of(mujoco.MjModel.from_xml_string(xml))
+
+
+def test_episodes_end_at_a_low_base_in_training_alone() -> None:
+    env = make(3, "g1", fall_height=0.75)
+    state = env.state.physics
+    qpos = state.qpos.clone()
+    qpos[:, 2] = torch.tensor([0.58, 0.56, 0.76])  # of 0.76 m by default: 0.57 m is 0.75
+    assert env.fell(state._replace(qpos=qpos)).tolist() == [False, True, False]
+    assert type(env).reference_settings(env.config).fall_height == 0.0
+
+
+def test_height_on_rough_ground_is_that_above_it() -> None:
+    env = make(4, "go1", fall_height=0.5)
+    rough = make_rough(4, fall_height=0.5)
+    state = rough.state.physics
+    height = rough.base_height(state)
+    assert (height - (env.model.key_qpos[0, 2] + 0.03)).abs().max() < 0.15
+    assert not rough.is_low(state).any()
+    lower = state.qpos.clone()
+    lower[:, 2] -= 0.6 * height
+    assert rough.is_low(state._replace(qpos=lower)).all()
