@@ -41,7 +41,7 @@ class VelocityShape(Reward):
     """Share of 1/(1 + x) in the terms `track_linear_velocity` and `track_angular_velocity`, which are e^−x in scores:
     that has no slope far from the command. For training."""
     pose_tail: Fraction = 0.0
-    """The same share in `pose` and `upright`, which have no slope far from the default pose. For training."""
+    """The same share in `pose`, `upright` and `base_height`, which have no slope far away. For training."""
 
 
 def velocity_terms(*others: Term) -> tuple[Term, ...]:
@@ -99,6 +99,7 @@ G1_TERMS = velocity_terms(
     Term("body_ang_vel", -0.05, schedule=cost_share),
     Term("angular_momentum", -0.02, schedule=cost_share),
     Term("self_collisions", -1.0, gradient=False, schedule=cost_share),
+    Term("base_height", 0.0, optional=True),
 )
 Go1Reward = reward_section("Go1Reward", __name__, GO1_TERMS, VelocityShape)
 Go1RoughReward = reward_section("Go1RoughReward", __name__, GO1_ROUGH_TERMS, VelocityShape)

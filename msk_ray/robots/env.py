@@ -113,6 +113,7 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         self.joint_names = [model.joint(joint).name for joint in range(1, model.njnt)]
         servos = servos_of(model)
         self.default_pose = self._start.qpos[0, 7:]
+        self.default_height = self._start.qpos[0, 2]
         self.action_size = len(servos)
         self.action_scale = self.tensor(
             _TORQUE_SHARE * model.actuator_forcerange[servos, 1] / model.actuator_gainprm[servos, 0]
@@ -161,7 +162,7 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     def is_low(self, state: StepState) -> Tensor:
         """Whether the base is lower than `env.fall_height` allows, (W,) bool."""
-        return self.base_height(state) < self.config.fall_height * self._start.qpos[0, 2]
+        return self.base_height(state) < self.config.fall_height * self.default_height
 
     def base_height(self, state: StepState) -> Tensor:
         """Height of the base above the ground [m], (W,)."""

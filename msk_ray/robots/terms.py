@@ -21,6 +21,8 @@ Robots = VelocityEnv[Any]
 
 _SWING_HEIGHT = 0.1
 """Height that feet should have in swing [m]."""
+_HEIGHT_SPREAD = 0.1
+"""Distance from the default height at which `base_height` is e^−1 [m]."""
 _AIR_TIME = 0.05, 0.5
 """Range of the time in the air that `air_time` rewards [s]."""
 _AIR_TIME_COMMAND = 0.5
@@ -73,6 +75,15 @@ def variable_posture(env: Robots, state: StepState, action: Tensor, obs: Tensor)
     """
     distance = (state.qpos[:, 7:] - env.default_pose) / env.pose_spread()
     return _closeness(distance.square().mean(-1), env.config.reward.pose_tail)
+
+
+def base_height(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+    """exp(−(height of the base − its default)² / (0.1 m)²). Not in mjlab: a slope out of a crouch, for training.
+
+    `env.reward.pose_tail` gives it one far from the default height as well.
+    """
+    distance = (env.base_height(state) - env.default_height) / _HEIGHT_SPREAD
+    return _closeness(distance.square(), env.config.reward.pose_tail)
 
 
 def body_ang_vel(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:

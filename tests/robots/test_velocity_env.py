@@ -19,7 +19,7 @@ from msk_ray.robots.env import VelocityEnv, servos_of
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1
 from msk_ray.robots.rough import Go1VelocityRough
-from msk_ray.robots.terms import upright, variable_posture
+from msk_ray.robots.terms import base_height, upright, variable_posture
 from msk_ray.step import StepState
 
 SCENES = Path(__file__).parents[2] / "msk_ray" / "robots" / "scenes"
@@ -177,7 +177,7 @@ def test_a_class_of_ones_own_has_the_terms_it_lists() -> None:
     env = Own(Own.Settings(name="own"), PhysicsConfig(), 2, "cpu", 0, None)
     assert {"angular_momentum", "self_collisions"} < set(env.reward_names)
     step = env.step(torch.zeros(2, 12))
-    assert step.terms.shape == (2, len(G1_TERMS) - 1), "air_time has no weight"
+    assert step.terms.shape == (2, len(G1_TERMS) - 2), "air_time and base_height have no weight"
     assert torch.isfinite(step.terms).all()
 
 
@@ -217,6 +217,8 @@ def test_episodes_end_at_a_low_base_in_training_alone() -> None:
     qpos = state.qpos.clone()
     qpos[:, 2] = torch.tensor([0.58, 0.56, 0.76])  # of 0.76 m by default: 0.57 m is 0.75
     assert env.fell(state._replace(qpos=qpos)).tolist() == [False, True, False]
+    height = base_height(env, state._replace(qpos=qpos), torch.zeros(3, 29), torch.zeros(3, 1))
+    assert height.tolist() == pytest.approx([math.exp(-3.24), math.exp(-4.0), 1.0], abs=1e-5)
     assert type(env).reference_settings(env.config).fall_height == 0.0
 
 
