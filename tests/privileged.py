@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from msk_ray.config.commands import Command
 from msk_ray.envs.cartpole.env import CartPole
 from msk_ray.step import StepState
 
@@ -24,6 +25,12 @@ class Privileged(CartPole):
 
     def observe_critic(self, state: StepState, action: Tensor) -> Tensor:
         return torch.cat((state.qpos, state.qvel, action), dim=-1)
+
+
+class Commanded(Privileged):
+    """With a command, whose settings are of a class that no module names."""
+
+    commands = (Command("pace", {"forward": (0.0, 2.0)}),)
 
 
 class Broken(Privileged):

@@ -16,7 +16,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe, wait
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import Any
 
 import torch
 
-from msk_ray.config import Config
+from msk_ray.config import Config, parse_config
 from msk_ray.errors import DeviceError, MskRayError, RankLost, SimulationError
 from msk_ray.group import PeerLost, ProcessGroup
 from msk_ray.signals import NUMBERS
@@ -61,7 +61,8 @@ class _Setup:
     """First message to a process."""
 
     rank: int
-    config: Config
+    config: Mapping[str, Any]
+    """Plain data: classes of settings that are made while a module is imported cannot be sent."""
     logdir: Path
     device: str
     together: int
@@ -120,7 +121,7 @@ class ParallelTrainer(TrialFolder):
             for number in range(len(devices)):
                 self._ranks.append(_Rank(number))
             for rank, own in zip(self._ranks, devices, strict=True):
-                rank.send(_Setup(rank.number, config, logdir, own, together, meeting))
+                rank.send(_Setup(rank.number, config.as_dict(), logdir, own, together, meeting))
             self.together: int = self._await()
         except BaseException:
             self._end()
@@ -290,21 +291,22 @@ def serve(connection: Connection) -> None:
     """
     try:
         setup: _Setup = connection.recv()
+        config = parse_config(setup.config)
         use_device(setup.device)
-        group = ProcessGroup(setup.rank, setup.config.execution.gpus, setup.device, setup.meeting)
+        group = ProcessGroup(setup.rank, config.execution.gpus, setup.device, setup.meeting)
         if setup.rank > 0:
             warnings.simplefilter("ignore")  # process 0 gives the same
-            follow(setup.config, setup.device, group)
+            follow(config, setup.device, group)
         else:
-            _lead(setup, group, connection)
+            _lead(setup, config, group, connection)
     except Exception as error:
         error.add_note(f"In a process of the trial, {os.getpid()}:\n{traceback.format_exc()}")
         connection.send(_Failure(_portable(error)))
 
 
-def _lead(setup: _Setup, group: ProcessGroup, connection: Connection) -> None:
+def _lead(setup: _Setup, config: Config, group: ProcessGroup, connection: Connection) -> None:
     """Run the trainer for the parent, until it is closed."""
-    trainer = Trainer(setup.config, setup.logdir, setup.device, setup.together, group)
+    trainer = Trainer(config, setup.logdir, setup.device, setup.together, group)
     connection.send(_Answer(trainer.together, trainer.epoch, trainer.best_score))
     try:
         while (call := connection.recv()).method != "close":

@@ -24,7 +24,7 @@ from msk_ray.training.parallel import _Answer, _Failure, _Rank
 pytestmark = pytest.mark.long
 
 SETTINGS: dict[str, Any] = {
-    "env": {"name": "privileged:Privileged", "nworld": 8, "episode_length": 10},
+    "env": {"name": "privileged:Commanded", "nworld": 8, "episode_length": 10},
     "physics": {"randomize": {"dof_damping": {"low": 0.5, "high": 2.0, "mode": "value"}}},
     "shac": {
         "horizon": {"kind": "adaptive", "start": 6, "shortest": 4, "longest": 12, "target": 5.0},
