@@ -1,6 +1,6 @@
 """Values that change linearly over training, for epochs counted from 0."""
 
-from typing import Any
+from typing import Any, Self
 
 from pydantic import model_validator
 
@@ -12,27 +12,34 @@ def ramp(start: float, end: float, epoch: float, last: int, first: int = 0) -> f
     return start + (end - start) * min(1.0, max(0.0, (epoch - first) / (last - first)))
 
 
-class CostSchedule(Section):
-    """Factor on the weights of costs in training: `start` until the epoch `begin`, 1 from the epoch `end` on, linear
-    between.
-
-    A robot that pays the full price for every change of its action from the start learns to stand still, before it has
-    learned to walk; one that pays nothing learns to tremble.
-    """
+class Rise(Section):
+    """A factor: `start` until the epoch `begin`, 1 from the epoch `end` on, linear between."""
 
     start: Fraction
     begin: Whole
     end: Count
 
     @model_validator(mode="after")
-    def _in_order(self) -> "CostSchedule":
+    def _in_order(self) -> Self:
         if self.begin >= self.end:
-            raise ValueError(f"cost_schedule.end has to be greater than begin, {self.begin}")
+            raise ValueError(f"end has to be greater than begin, {self.begin}")
         return self
 
     def at(self, epoch: int) -> float:
         """The factor at `epoch`, counted from 0."""
         return ramp(self.start, 1.0, epoch, self.end, self.begin)
+
+
+class CostSchedule(Rise):
+    """Factor on the weights of costs in training.
+
+    A robot that pays the full price for every change of its action from the start learns to stand still, before it has
+    learned to walk; one that pays nothing learns to tremble.
+    """
+
+
+class CommandSchedule(Rise):
+    """Factor on the ranges of commands in training. A humanoid that is asked to run at once learns to stand."""
 
 
 def cost_share(settings: Any, epoch: int) -> float:

@@ -7,7 +7,7 @@ from pydantic import Field, PositiveFloat
 
 from msk_ray.config.commands import Command, with_commands
 from msk_ray.config.rewards import reward_section, with_reward
-from msk_ray.config.schedules import CostSchedule, cost_share
+from msk_ray.config.schedules import CommandSchedule, CostSchedule, cost_share
 from msk_ray.config.sections import Count, Fraction, NonNegative, Reward
 from msk_ray.config.terms import Term, terms_in
 from msk_ray.envs.mjcf.config import MjcfSettings
@@ -76,6 +76,8 @@ class VelocitySettings(MjcfSettings):
     fall_height: Fraction = 0.0
     """In training, episodes also end when the base is lower than this share of its default height; 0: they do not. A
     robot that has sunk into a crouch seldom finds a way out of it. Not in scores."""
+    command_schedule: CommandSchedule | None = None
+    """Factor on the ranges of the commanded velocity and yaw rate in training; null: 1."""
     cost_schedule: CostSchedule | None = None
     """Factor on the weights of costs in training, all but `dof_pos_limits`; null: 1."""
     reward: VelocityShape = VelocityShape()

@@ -107,6 +107,7 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     Settings = VelocitySettings  # type: ignore[assignment]
     commands = (VELOCITY,)
     robot: ClassVar[Robot]
+    begin_epoch_in_place = True
 
     def prepare(self) -> None:
         model = self.model
@@ -131,6 +132,12 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         )
         self._down = self.tensor([0.0, 0.0, -1.0])
         self._start_range = _START.to(self.device)
+        self._widest = self.command_ranges["velocity"][:, :3].clone()
+
+    def begin_epoch(self, epoch: int) -> None:
+        super().begin_epoch(epoch)
+        if (schedule := self.config.command_schedule) is not None:
+            torch.mul(self._widest, schedule.at(epoch), out=self.command_ranges["velocity"][:, :3])
 
     @classmethod
     def edit(cls, spec: mujoco.MjSpec, config: AnyVelocitySettings, physics: PhysicsConfig) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import CostSchedule, PhysicsConfig
+from msk_ray.config import CommandSchedule, CostSchedule, PhysicsConfig
 from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
@@ -123,6 +123,17 @@ def test_costs_rise_in_training_alone() -> None:
     assert env.weighted_terms.shares.tolist() == [1.0] * len(costs)  # as in scores, which begin no epoch
     env.begin_epoch(0)
     assert env.weighted_terms.shares.tolist() == pytest.approx([0.1 if cost else 1.0 for cost in costs])
+
+
+def test_commands_widen_in_training_alone() -> None:
+    env = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
+    scored = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
+    for epoch, share in ((0, 0.5), (150, 0.75), (200, 1.0)):
+        env.begin_epoch(epoch)
+        low, high = env.command_ranges["velocity"][:, :4].tolist()
+        assert low == pytest.approx([-1.5 * share, -share, -0.7 * share, -math.pi], rel=1e-6)
+        assert high == pytest.approx([2.0 * share, share, 0.7 * share, math.pi], rel=1e-6)
+    assert scored.command_ranges["velocity"][1, 0] == 2.0
 
 
 def test_costs_that_never_rise_are_refused() -> None:
