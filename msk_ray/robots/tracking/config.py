@@ -11,6 +11,7 @@ from msk_ray.config.terms import Term, terms_in
 from msk_ray.robots.config import ServoSettings
 
 Sampling = Literal["adaptive", "uniform", "start"]
+Failure = Literal["mjlab", "pelvis"]
 Offset = Annotated[int, Field(ge=1, le=1000)]
 
 
@@ -85,9 +86,11 @@ class G1TrackingSettings(ServoSettings):
     score_sampling: Literal["uniform", "start"] = "uniform"
     """The same for scores."""
     adaptive: AdaptiveSampling = AdaptiveSampling()
-    failure: Literal["mjlab", "pelvis"] = "mjlab"
-    """When an episode ends early: as in mjlab (height and tilt of the torso, heights of hands and feet), or where the
-    height or the tilt of the pelvis is far off, as scores over all clips count it."""
+    failure: Failure = "mjlab"
+    """When an episode of training ends early: as in mjlab (height or tilt of the torso, or the height of a hand or
+    foot, is far off), or by height and tilt of the `pelvis` alone."""
+    score_failure: Failure = "mjlab"
+    """The same for scores."""
     cost_schedule: CostSchedule | None = None
     """Factor on the weights of `action_rate_l2` and `self_collisions` in training; null: 1."""
     reward: TrackingShape = TrackingShape()

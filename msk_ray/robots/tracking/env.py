@@ -9,13 +9,14 @@ from typing import Any, ClassVar, Final, NamedTuple
 import torch
 from torch import Tensor
 
+from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry, each, entries, vector
 from msk_ray.envs.memory import Memory
 from msk_ray.envs.records import EnvState, Transition
 from msk_ray.robots.robots import G1
 from msk_ray.robots.servos import ServoEnv
 from msk_ray.robots.tracking.config import TRACKING_TERMS, G1TrackingSettings
-from msk_ray.robots.tracking.references import Reference, References, Source, StartFrames, library_of
+from msk_ray.robots.tracking.references import Library, Reference, References, Source, StartFrames, library_of
 from msk_ray.step import StepState
 from msk_ray.step.autograd.tangent import quat_conjugate, quat_log, quat_multiply, quat_rotate
 
@@ -103,9 +104,19 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         self._act = self._start.act
 
     @classmethod
+    def library(cls, config: G1TrackingSettings) -> Library:
+        """The clips of these settings.
+
+        Raises:
+            ConfigError: as for `library_of`.
+        """
+        return library_of(Source.of(config, cls.build_model(config, PhysicsConfig()), cls.bodies))
+
+    @classmethod
     def reference_settings(cls, config: G1TrackingSettings) -> G1TrackingSettings:
-        quiet = {"reset_noise": 0.0, "reset_velocity_noise": 0.0, "failure": "mjlab"}
-        return super().reference_settings(config).model_copy(update={"sampling": config.score_sampling, **quiet})
+        quiet = {"reset_noise": 0.0, "reset_velocity_noise": 0.0}
+        scored = {"sampling": config.score_sampling, "failure": config.score_failure}
+        return super().reference_settings(config).model_copy(update={**scored, **quiet})
 
     # Episodes
 

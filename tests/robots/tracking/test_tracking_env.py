@@ -16,7 +16,10 @@ from msk_ray.robots.tracking.config import AdaptiveSampling
 from msk_ray.robots.tracking.env import G1Tracking
 from msk_ray.robots.tracking.motions import Clip, read_motions
 from msk_ray.robots.tracking.references import Library, References, StartFrames
-from msk_ray.step import StepState
+from msk_ray.step import Simulation, StepState
+from msk_ray.step.check.check import compare
+from msk_ray.step.check.oracle import Oracle, Point
+from msk_ray.step.check.pullback import simulated_gradients
 
 STILL = {"reset_noise": 0.0, "reset_velocity_noise": 0.0}
 
@@ -134,10 +137,10 @@ def test_scores_are_without_noise_and_a_world_has_a_clip_where_they_begin_with_i
     for name, end in (("a", 2.0), ("b", 4.0)):
         Clip.of(motion.at_rate(50.0).cut(0.0, end - 0.02), model).save(tmp_path / f"{name}.npz")
     trained = settings_class("g1_tracking")(
-        name="g1_tracking", motion=str(tmp_path), score_sampling="start", failure="pelvis", reward={"tail": 1.0}
+        name="g1_tracking", motion=str(tmp_path), score_sampling="start", score_failure="pelvis", reward={"tail": 1.0}
     )
     scored = G1Tracking.reference_settings(trained)
-    assert (scored.sampling, scored.failure, scored.reward.tail) == ("start", "mjlab", 0.0)
+    assert (scored.sampling, scored.failure, scored.reward.tail) == ("start", "pelvis", 0.0)
     env = make_env(scored, PhysicsConfig(), 4, "cpu", 0, differentiable=False)
     assert isinstance(env, G1Tracking)
     assert env.references.lengths == (100, 200)
@@ -228,3 +231,22 @@ def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
                 ends.append(float(value(moved)))
         slope = float((gradient[0] * torch.tensor(direction, dtype=torch.float32)).sum())
         assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-2, abs=2e-2)
+
+
+def test_a_step_from_a_frame_has_the_gradient_of_float64_differences() -> None:
+    env = make(1, **STILL)
+    physics = env._noisy(torch.tensor([60]))
+    qpos, qvel = (part[0].numpy().astype(np.float64) for part in physics[:2])
+    qpos[2] -= 0.006  # pressed on the ground
+    ctrl = env.control(torch.zeros(1, 29))[0].numpy().astype(np.float64)
+    point = Point(ctrl=ctrl, qpos=qpos.astype(np.float32).astype(np.float64), qvel=qvel, act=np.zeros(0))
+    cotangent = np.random.default_rng(0).standard_normal((1, 70)).astype(np.float32).astype(np.float64)
+    oracle = Oracle(env.model, 4)
+    assert oracle.touching(point)
+    reference = oracle.linearize(point)
+    assert not reference.at_kink(1e-3, 1e-2)
+    _, gradients = simulated_gradients(Simulation(env.model, 1, 4, tolerance=1e-9), [point], cotangent, ())
+    for key, expected in reference.pull_back(cotangent[0]).items():
+        if expected.size:
+            error, *_ = compare(gradients[key][0], expected, float(np.linalg.norm(cotangent)))
+            assert error < 2e-3, key
