@@ -83,8 +83,8 @@ def test_the_settings_of_an_import_path_are_checked_and_kept_whole(outside: Path
     [
         (
             None,
-            "env.name: missing; write cartpole, ant, hopper, cheetah, humanoid, g1_velocity, go1_velocity, "
-            "go1_velocity_rough, myoleg,",
+            "env.name: missing; write cartpole, ant, hopper, cheetah, humanoid, g1_tracking, g1_velocity, "
+            "go1_velocity, go1_velocity_rough, myoleg,",
         ),
         (3, "env.name: 3 is no name; write cartpole"),
         ("antt", "env.name: unknown name 'antt'; did you mean 'ant'?"),

@@ -280,7 +280,7 @@ class Env(Task[SettingsT]):
             terms = terms.masked_fill(diverged[:, None], 0.0)
         reward = terms.sum(-1)
         terminated = diverged | fell
-        truncated = (reached.age >= self.config.episode_length) & ~terminated
+        truncated = self.timed_out(reached) & ~terminated
         self.state = self.carried(self._reset_where(terminated | truncated, reached) if auto_reset else reached)
         return Transition(reward, terms.detach(), reached, obs, terminated, truncated, diverged)
 

@@ -16,6 +16,7 @@ from msk_ray.config.commands import settings_with_commands
 from msk_ray.config.rewards import settings_with
 from msk_ray.envs.layout import Entry
 from msk_ray.envs.memory import Memory
+from msk_ray.envs.records import EnvState
 from msk_ray.envs.reward import WeightedTerms
 from msk_ray.step import StepState
 from msk_ray.step.forward.solver_limits import own_limits
@@ -184,6 +185,11 @@ class Task(ABC, Generic[SettingsT]):
     def fell(self, state: StepState) -> Tensor:
         """Worlds (W,) bool whose episode ends by itself in `state`."""
         return torch.zeros(self.nworld, dtype=torch.bool, device=self.device)
+
+    def timed_out(self, reached: EnvState) -> Tensor:
+        """Worlds (W,) bool whose episode is cut in the state reached, although later steps would count: by default
+        after `episode_length` env steps."""
+        return reached.age >= self.config.episode_length
 
     # Names and figures
 

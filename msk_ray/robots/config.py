@@ -63,16 +63,21 @@ def velocity_terms(*others: Term) -> tuple[Term, ...]:
     )
 
 
+class ServoSettings(MjcfSettings):
+    """A robot whose joints are turned by position servos."""
+
+    action_range: PositiveFloat = 1.0
+    """mjlab's action for an action of 1 of the policy. mjlab's are not bounded; 1 asks a joint for an angle that its
+    servo, standing still, holds with a quarter of its largest torque."""
+
+
 @with_commands(VELOCITY)
-class VelocitySettings(MjcfSettings):
+class VelocitySettings(ServoSettings):
     """A legged robot that follows commands for its velocity."""
 
     episode_length: Count = 1000
     reset_noise: NonNegative = 0.0
     reset_velocity_noise: NonNegative = 0.0
-    action_range: PositiveFloat = 1.0
-    """mjlab's action for an action of 1 of the policy. mjlab's are not bounded; 1 asks a joint for an angle that its
-    servo, standing still, holds with a quarter of its largest torque."""
     fall_height: Fraction = 0.0
     """In training, episodes also end when the base is lower than this share of its default height; 0: they do not. A
     robot that has sunk into a crouch seldom finds a way out of it. Not in scores."""

@@ -5,17 +5,13 @@ Axes: W worlds, J joints but for the free one, F feet.
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar, Generic, TypeVar
+from typing import Generic, TypeVar
 
-import mujoco
 import torch
 from torch import Tensor
 
-from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry, each, entries, vector
 from msk_ray.envs.memory import Memory
-from msk_ray.envs.mjcf.env import MjcfEnv
-from msk_ray.errors import ConfigError
 from msk_ray.robots.config import (
     G1_TERMS,
     GO1_TERMS,
@@ -24,18 +20,15 @@ from msk_ray.robots.config import (
     Go1VelocitySettings,
     VelocitySettings,
 )
-from msk_ray.robots.robot import Robot, by_joint
+from msk_ray.robots.robot import by_joint
 from msk_ray.robots.robots import G1, GO1
+from msk_ray.robots.servos import ServoEnv
 from msk_ray.step import StepState
 from msk_ray.step.autograd.contact_state import AirTime, Contact
 from msk_ray.step.autograd.tangent import quat_conjugate, quat_multiply, quat_rotate
 
 AnyVelocitySettings = TypeVar("AnyVelocitySettings", bound=VelocitySettings)
 
-_TORQUE_SHARE = 0.25
-"""Share of a servo's largest torque with which it begins to turn to the target of mjlab's action 1."""
-_LIMIT_SHARE = 0.9
-"""Share of a joint's range, about its middle, beyond which the term `dof_pos_limits` counts."""
 _FALLEN = math.radians(70.0)
 """Tilt of the base from which an episode ends."""
 _START = torch.tensor([0.5, 0.5, 0.02, math.pi])
@@ -52,30 +45,7 @@ _HEADING_STIFFNESS = 0.5
 """Yaw rate asked for per error of the heading [1/s]."""
 
 
-def servos_of(model: mujoco.MjModel) -> list[int]:
-    """The position servo of each joint after the first, which is free.
-
-    Raises:
-        ConfigError: the first joint is not free, another is no hinge, or one has no position servo with a force range.
-    """
-    kinds = [mujoco.mjtJoint(kind) for kind in model.jnt_type]
-    if kinds[:1] != [mujoco.mjtJoint.mjJNT_FREE] or any(kind != mujoco.mjtJoint.mjJNT_HINGE for kind in kinds[1:]):
-        raise ConfigError("a velocity task needs a model whose first joint is free and whose others are hinges")
-    gain, stiffness = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 1]
-    usable = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)) & (gain > 0.0) & (stiffness > 0.0)
-    usable &= model.actuator_forcerange[:, 1] > 0.0
-    servo_of = {int(model.actuator_trnid[servo, 0]): int(servo) for servo in usable.nonzero()[0]}
-    for joint in range(1, model.njnt):
-        if joint not in servo_of:
-            name = model.joint(joint).name
-            raise ConfigError(
-                f"joint {name!r} needs a position servo with a force range, such as "
-                f'<position joint="{name}" kp="50" kv="2" forcerange="-40 40"/>'
-            )
-    return [servo_of[joint] for joint in range(1, model.njnt)]
-
-
-class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
+class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     """A robot on flat ground whose base is to move as commanded.
 
     A subclass has `mjcf`, `robot` and `terms` from `msk_ray.robots.terms`. The MJCF has one free joint, which comes
@@ -106,31 +76,16 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     Settings = VelocitySettings  # type: ignore[assignment]
     commands = (VELOCITY,)
-    robot: ClassVar[Robot]
     begin_epoch_in_place = True
 
     def prepare(self) -> None:
-        model = self.model
-        self.joint_names = [model.joint(joint).name for joint in range(1, model.njnt)]
-        servos = servos_of(model)
-        self.default_pose = self._start.qpos[0, 7:]
+        super().prepare()
         self.default_height = self._start.qpos[0, 2]
-        self.action_size = len(servos)
-        self.action_scale = self.tensor(
-            _TORQUE_SHARE * model.actuator_forcerange[servos, 1] / model.actuator_gainprm[servos, 0]
-        )
-        self._joint_of_servo = torch.tensor(
-            [int(joint) - 1 for joint in model.actuator_trnid[:, 0]], device=self.device
-        )
-        low, high = model.jnt_range[1:].T
-        middle, half = (low + high) / 2.0, _LIMIT_SHARE * (high - low) / 2.0
-        self.joint_limits = self.tensor(middle - half), self.tensor(middle + half)
         spread = self.robot.pose_spread
         self._spreads = torch.tensor(
             [by_joint(values, self.joint_names) for values in (spread.standing, spread.walking, spread.running)],
             device=self.device,
         )
-        self._down = self.tensor([0.0, 0.0, -1.0])
         self._start_range = _START.to(self.device)
         self._widest = self.command_ranges["velocity"][:, :3].clone()
 
@@ -138,14 +93,6 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         super().begin_epoch(epoch)
         if (schedule := self.config.command_schedule) is not None:
             torch.mul(self._widest, schedule.at(epoch), out=self.command_ranges["velocity"][:, :3])
-
-    @classmethod
-    def edit(cls, spec: mujoco.MjSpec, config: AnyVelocitySettings, physics: PhysicsConfig) -> None:
-        """Let the solver converge, which gradients need; mjlab stops it after 10 iterations."""
-        if physics.iterations is None:
-            spec.option.iterations = max(spec.option.iterations, 100)
-        if physics.ls_iterations is None:
-            spec.option.ls_iterations = max(spec.option.ls_iterations, 50)
 
     # Episodes
 
@@ -219,11 +166,6 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         into_base = quat_conjugate(frames.orientation(base))
         return quat_rotate(into_base, frames.velocity(base)), quat_rotate(into_base, frames.angular_velocity(base))
 
-    def gravity_in(self, state: StepState, body: str) -> Tensor:
-        """Direction of gravity in the axes of a body, (W, 3)."""
-        orientation = self.frames(state).orientation(body)
-        return quat_rotate(quat_conjugate(orientation), self._down.expand(self.nworld, 3))
-
     def foot_heights(self, state: StepState) -> Tensor:
         """Heights of the feet above the ground [m], (W, F); 0 below it."""
         return self.frames(state).site_position(self.robot.feet)[..., 2].clamp_min(0.0)
@@ -239,10 +181,6 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     def landed(self) -> Tensor:
         """1 for feet whose contact with the ground has begun in this step, else 0, (W, F)."""
         return self.air_time().first_contact(self.config.control_timestep).float()
-
-    def mjlab_action(self, action: Tensor) -> Tensor:
-        """mjlab's action for one of the policy, both (W, J)."""
-        return self.config.action_range * action
 
     # Memory
 
@@ -271,15 +209,7 @@ class VelocityEnv(MjcfEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
             "peak_height": peak.masked_fill(times.first_contact(self.config.control_timestep), 0.0),
         }
 
-    # Control and observation
-
-    def control(self, action: Tensor) -> Tensor:
-        """Targets of the servos [rad]: the default pose + `action_scale` × `action_range` × action."""
-        target = self.default_pose + self.action_scale * self.mjlab_action(action)
-        return target[:, self._joint_of_servo]
-
-    def action_names(self) -> list[str]:
-        return self.joint_names
+    # Observation
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         sensors = self.sensors(state)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.robots.env import VelocityEnv
+from msk_ray.robots.servos import ServoEnv
 from msk_ray.step import StepState
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ _COLLISION_FORCE = 10.0
 """Force from which a collision counts [N]."""
 
 
-def _closeness(relative: Tensor, tail: float) -> Tensor:
+def closeness(relative: Tensor, tail: float) -> Tensor:
     """e^−x, and for `tail` > 0, in training, a share of 1/(1 + x)."""
     close = torch.exp(-relative)
     return close if tail == 0.0 else torch.lerp(close, 1.0 / (1.0 + relative), tail)
@@ -44,7 +45,7 @@ def track_linear_velocity(env: Robots, state: StepState, action: Tensor, obs: Te
     """
     velocity, _ = env.base_velocities(state)
     error = (env.velocity_command()[:, :2] - velocity[:, :2]).square().sum(-1) + velocity[:, 2].square()
-    return _closeness(error / 0.25, env.config.reward.tail)
+    return closeness(error / 0.25, env.config.reward.tail)
 
 
 def track_angular_velocity(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -54,18 +55,18 @@ def track_angular_velocity(env: Robots, state: StepState, action: Tensor, obs: T
     """
     _, spin = env.base_velocities(state)
     error = (env.velocity_command()[:, 2] - spin[:, 2]).square() + spin[:, :2].square().sum(-1)
-    return _closeness(error / 0.5, env.config.reward.tail)
+    return closeness(error / 0.5, env.config.reward.tail)
 
 
 def upright(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
     """exp(−s² / 0.2), where s is the sine of the trunk's tilt. In training, `env.reward.pose_tail` gives it a slope."""
     tilt = env.gravity_in(state, env.robot.trunk)[:, :2].square().sum(-1)
-    return _closeness(tilt / 0.2, env.config.reward.pose_tail)
+    return closeness(tilt / 0.2, env.config.reward.pose_tail)
 
 
 def upright_on_ground(env: "Go1VelocityRough", state: StepState, action: Tensor, obs: Tensor) -> Tensor:
     """exp(−s² / 0.2), where s is the sine of the trunk's tilt to the ground around it."""
-    return _closeness(env.tilt_to_ground(state) / 0.2, env.config.reward.pose_tail)
+    return closeness(env.tilt_to_ground(state) / 0.2, env.config.reward.pose_tail)
 
 
 def variable_posture(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -74,7 +75,7 @@ def variable_posture(env: Robots, state: StepState, action: Tensor, obs: Tensor)
     In training, `env.reward.pose_tail` gives it a slope far from that pose.
     """
     distance = (state.qpos[:, 7:] - env.default_pose) / env.pose_spread()
-    return _closeness(distance.square().mean(-1), env.config.reward.pose_tail)
+    return closeness(distance.square().mean(-1), env.config.reward.pose_tail)
 
 
 def base_height(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -83,7 +84,7 @@ def base_height(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> T
     `env.reward.pose_tail` gives it one far from the default height as well.
     """
     distance = (env.base_height(state) - env.default_height) / _HEIGHT_SPREAD
-    return _closeness(distance.square(), env.config.reward.pose_tail)
+    return closeness(distance.square(), env.config.reward.pose_tail)
 
 
 def body_ang_vel(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
@@ -96,7 +97,7 @@ def angular_momentum(env: Robots, state: StepState, action: Tensor, obs: Tensor)
     return env.sensors(state)["root_angmom"].square().sum(-1)
 
 
-def dof_pos_limits(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+def dof_pos_limits(env: ServoEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
     """Sum over the joints of the angle beyond 90 % of the range [rad]."""
     low, high = env.joint_limits
     angles = state.qpos[:, 7:]
@@ -141,7 +142,7 @@ def soft_landing(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> 
     return (force * env.landed()).sum(-1) * env.is_commanded()
 
 
-def self_collisions(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
+def self_collisions(env: ServoEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
     """Number of substeps in which a contact between parts of the robot has more than 10 N. No slope.
 
     mjlab looks at one contact of a substep, whichever comes first; this at the strongest.

@@ -90,7 +90,7 @@ class Tally:
             self._tail.append(counted)
         self._fell |= alive & transition.terminated & ~transition.diverged
         self._diverged |= alive & transition.diverged
-        alive &= ~transition.terminated
+        alive &= ~(transition.terminated | transition.truncated)
 
     def all_ended(self) -> bool:
         """Check which policies have ended all their episodes; waits for the device."""
@@ -103,6 +103,6 @@ class Tally:
         success = None
         if self._tail and not all(self._ended):
             met = self._env.success({name: torch.stack([t[name] for t in self._tail]) for name in self._tail[0]})
-            success = None if met is None else met & self._alive
+            success = None if met is None else met & ~(self._fell | self._diverged)
         whole = Episodes(self._score, self._length, self._fell, self._diverged, self._terms, self._outcomes, success)
         return [whole.worlds(part, success=not end) for part, end in zip(self._parts, self._ended, strict=True)]

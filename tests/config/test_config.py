@@ -38,8 +38,8 @@ def test_a_config_survives_a_round_trip() -> None:
         ({"env": {"name": "ant"}, "physics": {"cone": "pyramidal", "solreffriction": [1, 1]}}, "cone: elliptic"),
         (
             {"env": {"name": "swimmer"}},
-            "env.name: unknown name 'swimmer'; write cartpole, ant, hopper, cheetah, humanoid, g1_velocity, "
-            "go1_velocity, go1_velocity_rough, myoleg, myoleg26, myosuite_walk or package.module:Class",
+            "env.name: unknown name 'swimmer'; write cartpole, ant, hopper, cheetah, humanoid, g1_tracking, "
+            "g1_velocity, go1_velocity, go1_velocity_rough, myoleg, myoleg26, myosuite_walk or package.module:Class",
         ),
         ({**CARTPOLE, "shac": {"critic_batches": 7}}, "critic_batches 7 must divide"),
         ({}, "env: missing"),

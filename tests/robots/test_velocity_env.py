@@ -15,10 +15,11 @@ from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
 from msk_ray.robots.config import G1_TERMS
-from msk_ray.robots.env import VelocityEnv, servos_of
+from msk_ray.robots.env import VelocityEnv
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1
 from msk_ray.robots.rough import Go1VelocityRough
+from msk_ray.robots.servos import servos_of
 from msk_ray.robots.terms import base_height, upright, variable_posture
 from msk_ray.step import StepState
 

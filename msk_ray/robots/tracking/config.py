@@ -1,0 +1,108 @@
+"""The settings of the tracking task. Source: `mjlab/tasks/tracking` of mjlab 1.6.0."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from msk_ray.config.rewards import reward_section, with_reward
+from msk_ray.config.schedules import CostSchedule, cost_share
+from msk_ray.config.sections import Count, Fraction, NonNegative, Reward, Section, Text
+from msk_ray.config.terms import Term, terms_in
+from msk_ray.robots.config import ServoSettings
+
+Sampling = Literal["adaptive", "uniform", "start"]
+Failure = Literal["mjlab", "pelvis"]
+Offset = Annotated[int, Field(ge=1, le=1000)]
+
+
+class TrackingShape(Reward):
+    """The settings of terms other than their weights."""
+
+    tail: Fraction = 0.0
+    """Share of 1/(1 + x) in the six terms of the motion, which are e^−x in scores: that has no slope far from it. For
+    training."""
+
+
+class AdaptiveSampling(Section):
+    """How starts of episodes are drawn more often where they have failed."""
+
+    uniform: Fraction = 0.1
+    """Share of the starts that are drawn anywhere. mjlab adds 0.1 to the failures of all worlds in a step instead, so
+    that its share depends on their number."""
+    alpha: Annotated[float, Field(gt=0.0, le=1.0)] = 0.001
+    """Share of the newest env step in the mean of failures."""
+    kernel: Annotated[int, Field(ge=1, le=60)] = 1
+    """Seconds before a failure whose starts it makes likelier."""
+    decay: Fraction = 0.8
+    """What is left of that from one second to the one before."""
+
+
+TRACKING_TERMS = terms_in(
+    "msk_ray.robots.tracking.terms",
+    Term("motion_global_root_pos", 0.5),
+    Term("motion_global_root_ori", 0.5),
+    Term("motion_body_pos", 1.0),
+    Term("motion_body_ori", 1.0),
+    Term("motion_body_lin_vel", 1.0),
+    Term("motion_body_ang_vel", 1.0),
+    Term("action_rate_l2", -0.1, schedule=cost_share),
+    Term("joint_limit", -10.0, "msk_ray.robots.terms:dof_pos_limits"),
+    Term("self_collisions", -10.0, "msk_ray.robots.terms:self_collisions", gradient=False, schedule=cost_share),
+)
+MOTION_TERMS = tuple(term.name for term in TRACKING_TERMS if term.name.startswith("motion_"))
+"""Those that say how close the robot is to the motion; each is 1 at most, times its weight."""
+G1TrackingReward = reward_section("G1TrackingReward", __name__, TRACKING_TERMS, TrackingShape)
+
+
+@with_reward(G1TrackingReward)
+class G1TrackingSettings(ServoSettings):
+    """Unitree's humanoid G1 follows motions of people. mjlab's `Mjlab-Tracking-Flat-Unitree-G1`."""
+
+    episode_length: Count = 500
+    reset_noise: NonNegative = 1.0
+    """Share of mjlab's noise in initial poses: 5 cm, 1 cm upward, 0.1 rad of tilt, 0.2 rad of heading, and 0.1 rad of
+    each joint at most. 0 in scores."""
+    reset_velocity_noise: NonNegative = 1.0
+    """Share of mjlab's noise in initial velocities of the base: 0.5 m/s, 0.2 m/s upward, 0.52 rad/s of tilt and 0.78
+    rad/s of heading at most. 0 in scores."""
+    motion: Text = "builtin:squat"
+    """Motions to follow: a file .csv or .npz, a folder of them, or a built-in one."""
+    cut: tuple[NonNegative, NonNegative] | None = None
+    """Part of each motion to follow, from one time to another [s]; null: all of it."""
+    mirror: bool = False
+    """Follow each motion's mirror image too."""
+    layout: Literal["full", "no_state_estimation"] = "full"
+    """What the policy sees: `full` has the position of the anchor and the velocity of the IMU, which a robot cannot
+    measure; mjlab calls the other one so. The critic sees all of it."""
+    critic_bodies: bool = True
+    """Whether the critic also sees position and orientation of all tracked bodies, as in mjlab."""
+    future_frames: tuple[Offset, ...] = ()
+    """Env steps ahead whose reference the policy sees too, such as [1, 2, 4, 8]."""
+    action_about: Literal["default", "reference"] = "default"
+    """What an action of 0 asks of the joints: the default pose, as in mjlab, or the reference's angles."""
+    sampling: Sampling = "adaptive"
+    """Where episodes of training begin: anywhere, but more often where they have failed (`adaptive`), anywhere
+    (`uniform`), or with the first frame of each motion (`start`)."""
+    score_sampling: Literal["uniform", "start"] = "uniform"
+    """The same for scores."""
+    adaptive: AdaptiveSampling = AdaptiveSampling()
+    failure: Failure = "mjlab"
+    """When an episode of training ends early: as in mjlab (height or tilt of the torso, or the height of a hand or
+    foot, is far off), or by height and tilt of the `pelvis` alone."""
+    score_failure: Failure = "mjlab"
+    """The same for scores."""
+    cost_schedule: CostSchedule | None = None
+    """Factor on the weights of `action_rate_l2` and `self_collisions` in training; null: 1."""
+    reward: TrackingShape = TrackingShape()
+
+    @model_validator(mode="after")
+    def _cut_in_order(self) -> "G1TrackingSettings":
+        if self.cut is not None and self.cut[0] >= self.cut[1]:
+            raise ValueError(f"env.cut: {self.cut[0]:g} to {self.cut[1]:g} s is no part of a motion")
+        return self
+
+    def unread(self) -> dict[str, str]:
+        if self.sampling == "adaptive":
+            return super().unread()
+        unread = {f"adaptive.{name}": f"env.sampling is {self.sampling}" for name in AdaptiveSampling.model_fields}
+        return {**super().unread(), **unread}

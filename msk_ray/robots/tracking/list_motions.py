@@ -1,0 +1,108 @@
+"""`msk-ray motions`: what motions are there, and can the robot follow them?"""
+
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from msk_ray.cli import Parser, positive, run
+from msk_ray.errors import ConfigError, DeviceError
+from msk_ray.files import make_folder
+from msk_ray.text_table import text_table
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from msk_ray.robots.tracking.motions import Motion
+
+DESCRIPTION = """\
+List motions of Unitree's G1: their duration, frames, and what is wrong with them (joints beyond their ranges, parts in
+the ground). Files that are no motion of this robot are refused, each in one line.
+
+Reads CSV with a frame a line at 30 Hz, as of Unitree's retargeted LAFAN1 (position, quaternion x, y, z, w, 29 joints),
+and NPZ of mjlab's csv_to_npz. Draws a strip with a row for each motion."""
+
+EXAMPLES = """\
+  msk-ray motions builtin:squat
+  msk-ray motions g1/                                  # a folder of .csv and .npz
+  msk-ray motions g1/dance1_subject2.csv --npz mjlab/  # for mjlab, at 50 Hz
+  msk-ray motions g1/ --strip none
+
+exit codes: 0 done, 1 a file was refused, 2 there is none."""
+
+
+def parser() -> Parser:
+    """The command line."""
+    p = Parser("msk-ray motions", DESCRIPTION, EXAMPLES)
+    p.add_argument("where", metavar="FILE|FOLDER|builtin:NAME", help="the motions")
+    p.add_argument(
+        "--strip", default="motions.png", metavar="FILE", help="picture to draw, or none (default: %(default)s)"
+    )
+    p.add_argument("--frames", type=positive, default=8, metavar="N", help="frames in a row (default: %(default)s)")
+    p.add_argument("--npz", type=Path, metavar="DIR", help="also write each as mjlab's csv_to_npz does, at 50 Hz")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = parser().parse_args(argv)
+
+    from msk_ray.config import PhysicsConfig
+    from msk_ray.robots.tracking.config import G1TrackingSettings
+    from msk_ray.robots.tracking.env import G1Tracking
+    from msk_ray.robots.tracking.motions import BUILTIN, Clip, motion_files, read_motion, read_motions, remarks
+
+    settings = G1TrackingSettings(name="g1_tracking")
+    model = G1Tracking.build_model(settings, PhysicsConfig())
+    motions: list[Motion] = []
+    refused: list[str] = []
+    if args.where.startswith(BUILTIN):
+        motions = read_motions(args.where, model)
+    else:
+        for path in motion_files(args.where):
+            try:
+                motions.append(read_motion(path, model))
+            except ConfigError as error:
+                refused.append(str(error))
+    rows = [
+        (motion.name, f"{motion.seconds:.1f}", str(len(motion)), f"{motion.rate:g}", "; ".join(remarks(motion, model)))
+        for motion in motions
+    ]
+    print(text_table(("motion", "seconds", "frames", "Hz", "remarks"), rows, shutil.get_terminal_size((160, 24))[0]))
+    seconds = sum(motion.seconds for motion in motions)
+    print(f"{len(motions)} motions, {seconds:.0f} s ({seconds / 3600.0:.2f} h)")
+    for line in refused:
+        print(f"refused: {line}")
+    if args.npz is not None:
+        make_folder(args.npz)
+        for motion in motions:
+            Clip.of(motion.at_rate(1.0 / settings.control_timestep), model).save(args.npz / f"{motion.name}.npz")
+        print(f"written into {args.npz}")
+    if args.strip != "none" and motions:
+        print(_drawn(motions, model, args.frames, Path(args.strip)))
+    return 1 if refused else 0
+
+
+def _drawn(motions: "Sequence[Motion]", model: "mujoco.MjModel", count: int, path: Path) -> str:
+    """Draw a row for each motion; returns what to say of it."""
+    import numpy as np
+
+    from msk_ray.visualize.film import grid
+    from msk_ray.visualize.render import States, View, frames
+
+    images, captions = [], []
+    try:
+        for motion in motions:
+            shown = np.unique(np.linspace(0, len(motion) - 1, count).round().astype(int))
+            empty = [np.zeros((len(shown), size)) for size in (model.nv, model.na, model.nu)]
+            images.append(list(frames(States(model, motion.qpos[shown], *empty), View(width=240, height=240))))
+            captions.append([f"{frame / motion.rate:.1f} s" for frame in shown])
+    except DeviceError as error:
+        return f"nothing drawn: {error}"
+    grid(images, [motion.name for motion in motions], captions).save(path)
+    return f"drawn in {path}"
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

@@ -1,0 +1,410 @@
+"""Motions of a robot: read, checked, resampled, cut, mirrored, and with the velocities and frames of its bodies.
+
+Velocities are finite differences, as in mjlab's `csv_to_npz`; frames of bodies are those of the step's own kinematics.
+
+Axes: F frames, J joints but for the free one, B bodies but for the world.
+"""
+
+import math
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import mujoco
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from msk_ray.errors import ConfigError, brief
+from msk_ray.step.adjoint.forward_kinematics import FrameWalk
+
+Array = NDArray[np.float64]
+
+CSV_RATE: Final = 30.0
+"""Frames per second of CSV files, which do not say it."""
+BUILTIN: Final = "builtin:"
+SUFFIXES: Final = (".csv", ".npz")
+_MOST_BYTES: Final = 2**28
+"""Largest file, and largest content of one, that is read."""
+_FEWEST_FRAMES: Final = 3
+_UNIT: Final = 0.01
+"""Distance of a quaternion's length from 1 with which it is refused."""
+_SLACK: Final = 0.02
+"""Angle beyond a joint's range that is not worth a word [rad]."""
+_OTHER_ORDER: Final = 0.5
+"""Angle beyond a joint's range [rad] that is a sign of another order of joints, if a tenth of the frames have it."""
+_SUNK: Final = 0.03
+"""Depth in the ground from which it is told [m]."""
+_TOGETHER: Final = 4096
+"""Frames whose bodies are placed at once."""
+_LOOKED_AT: Final = 5
+"""The ground is looked for in every fifth frame."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Poses of a robot at equal times."""
+
+    name: str
+    rate: float
+    """Frames per second [1/s]."""
+    position: Array
+    """Of the base [m], (F, 3)."""
+    orientation: Array
+    """Of the base, unit quaternions (w, x, y, z), (F, 4)."""
+    joints: Array
+    """Angles [rad], (F, J)."""
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    @property
+    def seconds(self) -> float:
+        """From the first frame to the last [s]."""
+        return (len(self) - 1) / self.rate
+
+    @property
+    def qpos(self) -> Array:
+        """As MuJoCo's, (F, 7 + J)."""
+        return np.concatenate((self.position, self.orientation, self.joints), axis=1)
+
+    def at_rate(self, rate: float) -> "Motion":
+        """The motion with another number of frames per second: positions and angles are interpolated, and orientations
+        turned evenly. As in mjlab, its last frame is left out."""
+        if math.isclose(rate, self.rate):
+            return self
+        times = np.arange(0.0, self.seconds, 1.0 / rate)
+        place = times * self.rate
+        before = np.minimum(place.astype(int), len(self) - 2)
+        share = (place - before)[:, None]
+
+        def between(values: Array) -> Array:
+            return (1.0 - share) * values[before] + share * values[before + 1]
+
+        turned = slerp(self.orientation[before], self.orientation[before + 1], share)
+        return Motion(self.name, rate, between(self.position), turned, between(self.joints))
+
+    def cut(self, start: float, end: float) -> "Motion":
+        """The part from one time to another [s].
+
+        Raises:
+            ConfigError: it has fewer than 3 frames.
+        """
+        first, last = math.ceil(start * self.rate - 1e-6), math.floor(end * self.rate + 1e-6)
+        part = slice(first, last + 1)
+        if len(self.position[part]) < _FEWEST_FRAMES:
+            raise ConfigError(
+                f"env.cut: {self.name} is {self.seconds:.2f} s long, and {start:g} to {end:g} s has fewer than "
+                f"{_FEWEST_FRAMES} frames of it"
+            )
+        return replace(self, position=self.position[part], orientation=self.orientation[part], joints=self.joints[part])
+
+    def mirrored(self, model: mujoco.MjModel) -> "Motion":
+        """The motion with left and right exchanged."""
+        names = [model.joint(joint).name for joint in range(1, model.njnt)]
+        partner = [names.index(_other_side(name)) for name in names]
+        # Turning about the y axis, which is normal to the mirror, looks the same in it.
+        signs = np.where(np.abs(model.jnt_axis[1:, 1]) > 0.5, 1.0, -1.0)
+        return replace(
+            self,
+            name=f"{self.name} mirrored",
+            position=self.position * (1.0, -1.0, 1.0),
+            orientation=self.orientation * (1.0, -1.0, 1.0, -1.0),
+            joints=self.joints[:, partner] * signs,
+        )
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A motion with its velocities and the frames of all bodies, in world coordinates."""
+
+    motion: Motion
+    joint_rates: Array
+    """[rad/s], (F, J)."""
+    position: Array
+    """[m], (F, B, 3)."""
+    orientation: Array
+    """Unit quaternions (w, x, y, z), (F, B, 4)."""
+    velocity: Array
+    """Of the bodies' origins [m/s], (F, B, 3)."""
+    angular_velocity: Array
+    """[rad/s], (F, B, 3)."""
+
+    def __len__(self) -> int:
+        return len(self.motion)
+
+    @classmethod
+    def of(cls, motion: Motion, model: mujoco.MjModel) -> "Clip":
+        """The clip of a motion."""
+        step = 1.0 / motion.rate
+        rates, linear = np.gradient(motion.joints, step, axis=0), np.gradient(motion.position, step, axis=0)
+        spin = _spin(motion.orientation, step)
+        into_base = motion.orientation * (1.0, -1.0, -1.0, -1.0)
+        qvel = np.concatenate((linear, _rotated(into_base, spin), rates), axis=1)
+        return cls(motion, rates, *_frames(model, motion.qpos, qvel))
+
+    def save(self, path: Path) -> None:
+        """Write the file that mjlab's `csv_to_npz` writes."""
+        np.savez_compressed(
+            path,
+            fps=np.array([self.motion.rate]),
+            joint_pos=self.motion.joints.astype(np.float32),
+            joint_vel=self.joint_rates.astype(np.float32),
+            body_pos_w=self.position.astype(np.float32),
+            body_quat_w=self.orientation.astype(np.float32),
+            body_lin_vel_w=self.velocity.astype(np.float32),
+            body_ang_vel_w=self.angular_velocity.astype(np.float32),
+        )
+
+
+def motion_files(where: str) -> list[Path]:
+    """The files of motions that a path means: itself, or those in a folder, in the order of their names.
+
+    Raises:
+        ConfigError: there are none.
+    """
+    path = Path(where).expanduser()
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.suffix in SUFFIXES and file.is_file())
+        if not files:
+            raise ConfigError(f"{path}: no motions in this folder: they are files *.csv or *.npz")
+        return files
+    if not path.is_file():
+        known = ", ".join(f"{BUILTIN}{name}" for name in BUILTIN_MOTIONS)
+        raise ConfigError(f"no motion {brief(where)}: write a file .csv or .npz, a folder of them, or {known}")
+    return [path]
+
+
+def read_motions(where: str, model: mujoco.MjModel) -> list[Motion]:
+    """The motions of a file, of a folder, or of a name such as `builtin:squat`, as they are.
+
+    Raises:
+        ConfigError: there are none, or one is not a motion of this robot.
+    """
+    if where.startswith(BUILTIN):
+        make = BUILTIN_MOTIONS.get(where.removeprefix(BUILTIN))
+        if make is None:
+            known = ", ".join(f"{BUILTIN}{name}" for name in BUILTIN_MOTIONS)
+            raise ConfigError(f"no motion {brief(where)}: the built-in ones are {known}")
+        return [make(model)]
+    return [read_motion(path, model) for path in motion_files(where)]
+
+
+def read_motion(path: Path, model: mujoco.MjModel) -> Motion:
+    """The motion in a file: CSV with a frame a line, as of Unitree's retargeted LAFAN1 (position of the base,
+    quaternion x, y, z, w, angles of the joints in the order of the model), or NPZ as mjlab's `csv_to_npz` writes it.
+
+    Raises:
+        ConfigError: it is none of this robot.
+    """
+    read = {".csv": _read_csv, ".npz": _read_npz}.get(path.suffix)
+    if read is None:
+        raise ConfigError(f"{path}: a motion is a file .csv or .npz")
+    if path.stat().st_size > _MOST_BYTES:
+        raise ConfigError(f"{path}: larger than {_MOST_BYTES // 2**20} MiB, which no motion is")
+    rate, qpos = read(path)
+    joints = model.njnt - 1
+    if qpos.ndim != 2 or qpos.shape[1] != 7 + joints:
+        columns = qpos.shape[-1] if qpos.ndim == 2 else 0
+        raise ConfigError(
+            f"{path}: {columns} numbers a frame, not {7 + joints}: 3 of the position, 4 of the orientation and "
+            f"{joints} joints, from {model.joint(1).name} to {model.joint(joints).name}"
+        )
+    if len(qpos) < _FEWEST_FRAMES:
+        raise ConfigError(f"{path}: {len(qpos)} frames; a motion has {_FEWEST_FRAMES} or more")
+    if not np.isfinite(qpos).all():
+        raise ConfigError(f"{path}: frame {int(np.flatnonzero(~np.isfinite(qpos).all(1))[0])} is not finite")
+    length = np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    if (np.abs(length - 1.0) > _UNIT).any():
+        frame = int(np.abs(length - 1.0).argmax())
+        raise ConfigError(
+            f"{path}: columns 4 to 7 of frame {frame} are no unit quaternion (length {length[frame, 0]:.3g})"
+        )
+    motion = Motion(path.stem, rate, qpos[:, :3], qpos[:, 3:7] / length, qpos[:, 7:])
+    _check_order(path, motion, model)
+    return motion
+
+
+def _read_csv(path: Path) -> tuple[float, Array]:
+    try:
+        rows = np.loadtxt(path, delimiter=",", ndmin=2)
+    except (ValueError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a table of numbers: {' '.join(str(error).split())}") from None
+    if rows.shape[1] >= 7:
+        rows[:, 3:7] = rows[:, [6, 3, 4, 5]]
+    return CSV_RATE, rows
+
+
+def _read_npz(path: Path) -> tuple[float, Array]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > _MOST_BYTES:
+                raise ConfigError(f"{path}: its content is larger than {_MOST_BYTES // 2**20} MiB, which no motion is")
+        with np.load(path, allow_pickle=False) as arrays:
+            rate = float(np.ravel(arrays["fps"])[0])
+            base = [np.asarray(arrays[name], np.float64)[:, 0] for name in ("body_pos_w", "body_quat_w")]
+            joints = np.asarray(arrays["joint_pos"], np.float64)
+            qpos = np.concatenate((*base, joints), axis=1)
+    except KeyError as error:
+        raise ConfigError(f"{path}: {error.args[0]}: write the file with mjlab's csv_to_npz") from None
+    except (ValueError, IndexError, OSError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path}: not a file of mjlab's csv_to_npz: {' '.join(str(error).split())}") from None
+    if not 1.0 <= rate <= 1000.0:
+        raise ConfigError(f"{path}: {rate:g} frames per second; 1 to 1000 are possible")
+    return rate, qpos
+
+
+def _check_order(path: Path, motion: Motion, model: mujoco.MjModel) -> None:
+    excess = beyond_range(motion, model)
+    often = (excess > _OTHER_ORDER).mean(0)
+    if (often > 0.1).any():
+        joint = int(often.argmax())
+        raise ConfigError(
+            f"{path}: column {8 + joint} is up to {excess[:, joint].max():.2g} rad beyond the range of "
+            f"{model.joint(joint + 1).name}: joints are in the order of the robot's model, from {model.joint(1).name} "
+            f"to {model.joint(model.njnt - 1).name}"
+        )
+
+
+def beyond_range(motion: Motion, model: mujoco.MjModel) -> Array:
+    """Angles beyond the ranges of the joints [rad], (F, J)."""
+    low, high = model.jnt_range[1:].T
+    return np.maximum(np.maximum(low - motion.joints, motion.joints - high), 0.0)
+
+
+def remarks(motion: Motion, model: mujoco.MjModel) -> list[str]:
+    """What is wrong with a motion that can be followed all the same, one line each."""
+    found = []
+    excess = beyond_range(motion, model)
+    if (worst := float(excess.max())) > _SLACK:
+        joint = int(excess.max(0).argmax())
+        share = float((excess > _SLACK).any(1).mean())
+        found.append(f"{model.joint(joint + 1).name} up to {worst:.2f} rad beyond its range, any joint in {share:.0%}")
+    depth = ground_depth(motion, model)
+    if (deepest := float(depth.max())) > _SUNK:
+        share = float((depth > _SUNK).mean())
+        found.append(f"up to {100.0 * deepest:.0f} cm in the ground, more than {100.0 * _SUNK:.0f} cm in {share:.0%}")
+    return found
+
+
+def ground_depth(motion: Motion, model: mujoco.MjModel) -> Array:
+    """Depth of the robot's deepest part in the ground [m], in every fifth frame; 0 above it."""
+    data = mujoco.MjData(model)
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    depths = []
+    for qpos in motion.qpos[::_LOOKED_AT]:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        with_ground = fixed[data.contact.geom].any(-1) if data.ncon else np.zeros(0, bool)
+        depths.append(max(0.0, *(-data.contact.dist[with_ground])) if with_ground.any() else 0.0)
+    return np.array(depths)
+
+
+def slerp(start: Array, end: Array, share: Array) -> Array:
+    """Unit quaternions (F, 4) at shares (F, 1) of the shorter way from one to another."""
+    cosine = (start * end).sum(-1, keepdims=True)
+    end, cosine = np.where(cosine < 0.0, -end, end), np.abs(cosine)
+    angle = np.arccos(np.minimum(cosine, 1.0))
+    sine = np.sin(angle)
+    close = sine < 1e-8
+    safe = np.where(close, 1.0, sine)
+    first = np.where(close, 1.0 - share, np.sin((1.0 - share) * angle) / safe)
+    second = np.where(close, share, np.sin(share * angle) / safe)
+    turned = first * start + second * end
+    unit: Array = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+    return unit
+
+
+def _spin(orientation: Array, step: float) -> Array:
+    """Angular velocity in world coordinates [rad/s], (F, 3), from the frames before and after; at both ends that of the
+    neighbour."""
+    turn = _product(orientation[2:], orientation[:-2] * (1.0, -1.0, -1.0, -1.0))
+    turn = np.where(turn[:, :1] < 0.0, -turn, turn)
+    sine = np.linalg.norm(turn[:, 1:], axis=-1, keepdims=True)
+    scale = np.where(sine > 1e-9, 2.0 * np.arctan2(sine, turn[:, :1]) / np.maximum(sine, 1e-9), 2.0)
+    spin = scale * turn[:, 1:] / (2.0 * step)
+    return np.concatenate((spin[:1], spin, spin[-1:]))
+
+
+def _product(a: Array, b: Array) -> Array:
+    (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
+    return np.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        axis=-1,
+    )
+
+
+def _rotated(orientation: Array, vector: Array) -> Array:
+    twice = 2.0 * np.cross(orientation[:, 1:], vector)
+    turned: Array = vector + orientation[:, :1] * twice + np.cross(orientation[:, 1:], twice)
+    return turned
+
+
+def _frames(model: mujoco.MjModel, qpos: Array, qvel: Array) -> tuple[Array, Array, Array, Array]:
+    """Positions, orientations, velocities and angular velocities of the robot's bodies, each (F, B, ·)."""
+    walk = FrameWalk(model, _TOGETHER, wp.get_device("cpu"))
+    own = walk.body_frame[_robot_bodies(model)]
+    found = []
+    for first in range(0, len(qpos), _TOGETHER):
+        part = slice(first, first + _TOGETHER)
+        count = len(qpos[part])
+        walk.qpos.numpy()[:count], walk.qvel.numpy()[:count] = qpos[part], qvel[part]
+        walk.launch_forward()
+        found.append([array.numpy()[:count, own].astype(np.float64) for array in walk.frames])
+    position, orientation, velocity, spin = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return position, np.roll(orientation, 1, axis=-1), velocity, spin  # Warp has (x, y, z, w)
+
+
+def _robot_bodies(model: mujoco.MjModel) -> NDArray[np.int64]:
+    """The bodies that move with the free joint, in their order, which is also that of mjlab's files."""
+    return np.flatnonzero(model.body_rootid == model.jnt_bodyid[0])
+
+
+def body_names(model: mujoco.MjModel) -> list[str]:
+    """Names of the bodies of a clip."""
+    return [model.body(int(body)).name for body in _robot_bodies(model)]
+
+
+def _other_side(name: str) -> str:
+    if name.startswith("left_"):
+        return f"right_{name.removeprefix('left_')}"
+    return f"left_{name.removeprefix('right_')}" if name.startswith("right_") else name
+
+
+def _squat(model: mujoco.MjModel) -> Motion:
+    """From the default pose down and up again within 4 s, with the feet in place, swinging arms and a turning waist."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    standing = data.qpos.copy()
+    count = round(4.0 * CSV_RATE) + 1
+    phase = 2.0 * math.pi * np.arange(count) / (count - 1)
+    down, side = (1.0 - np.cos(phase)) / 2.0, np.sin(phase)
+    shifts = {
+        **{f"{leg}_hip_pitch_joint": -0.55 * down for leg in ("left", "right")},
+        **{f"{leg}_knee_joint": 1.0 * down for leg in ("left", "right")},
+        **{f"{leg}_ankle_pitch_joint": -0.45 * down for leg in ("left", "right")},
+        "left_shoulder_pitch_joint": -0.8 * down + 0.3 * side,
+        "right_shoulder_pitch_joint": -0.8 * down - 0.3 * side,
+        "waist_yaw_joint": 0.3 * side,
+    }
+    qpos = np.tile(standing, (count, 1))
+    for joint, shift in shifts.items():
+        qpos[:, model.joint(joint).qposadr[0]] += shift
+    ankles = [model.body(f"{leg}_ankle_roll_link").id for leg in ("left", "right")]
+    still = _frames(model, qpos, np.zeros((count, model.nv)))[0]
+    first = int(_robot_bodies(model)[0])
+    feet = still[:, [ankle - first for ankle in ankles]].mean(1)
+    qpos[:, :3] += feet[0] - feet
+    return Motion("squat", CSV_RATE, qpos[:, :3], qpos[:, 3:7], qpos[:, 7:])
+
+
+BUILTIN_MOTIONS: Final[dict[str, Callable[[mujoco.MjModel], Motion]]] = {"squat": _squat}
+"""Motions that need no file, by name."""
