@@ -350,13 +350,16 @@ def _rotated(orientation: Array, vector: Array) -> Array:
 
 def _frames(model: mujoco.MjModel, qpos: Array, qvel: Array) -> tuple[Array, Array, Array, Array]:
     """Positions, orientations, velocities and angular velocities of the robot's bodies, each (F, B, ·)."""
-    walk = FrameWalk(model, _TOGETHER, wp.get_device("cpu"))
+    walk = FrameWalk(model, _TOGETHER, wp.get_device())
+    rows = [np.zeros((_TOGETHER, size), dtype=np.float32) for size in (model.nq, model.nv)]
     own = walk.body_frame[_robot_bodies(model)]
     found = []
     for first in range(0, len(qpos), _TOGETHER):
         part = slice(first, first + _TOGETHER)
         count = len(qpos[part])
-        walk.qpos.numpy()[:count], walk.qvel.numpy()[:count] = qpos[part], qvel[part]
+        for array, row, values in zip((walk.qpos, walk.qvel), rows, (qpos, qvel), strict=True):
+            row[:count] = values[part]
+            array.assign(row)
         walk.launch_forward()
         found.append([array.numpy()[:count, own].astype(np.float64) for array in walk.frames])
     position, orientation, velocity, spin = (np.concatenate(parts) for parts in zip(*found, strict=True))
