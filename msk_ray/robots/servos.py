@@ -6,7 +6,9 @@ Axes: W worlds, J joints but for the free one.
 from typing import ClassVar, Generic, TypeVar
 
 import mujoco
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
@@ -48,6 +50,15 @@ def servos_of(model: mujoco.MjModel) -> list[int]:
     return [servo_of[joint] for joint in range(1, model.njnt)]
 
 
+def action_scale_of(model: mujoco.MjModel) -> NDArray[np.float64]:
+    """Angle of each joint for mjlab's action 1 [rad], (J,)."""
+    servos = servos_of(model)
+    scale: NDArray[np.float64] = (
+        _TORQUE_SHARE * model.actuator_forcerange[servos, 1] / model.actuator_gainprm[servos, 0]
+    )
+    return scale
+
+
 class ServoEnv(MjcfEnv[AnyServoSettings], Generic[AnyServoSettings]):
     """A robot whose actions turn the targets of its servos away from the default pose.
 
@@ -61,12 +72,9 @@ class ServoEnv(MjcfEnv[AnyServoSettings], Generic[AnyServoSettings]):
     def prepare(self) -> None:
         model = self.model
         self.joint_names = [model.joint(joint).name for joint in range(1, model.njnt)]
-        servos = servos_of(model)
         self.default_pose = self._start.qpos[0, 7:]
-        self.action_size = len(servos)
-        self.action_scale = self.tensor(
-            _TORQUE_SHARE * model.actuator_forcerange[servos, 1] / model.actuator_gainprm[servos, 0]
-        )
+        self.action_scale = self.tensor(action_scale_of(model))
+        self.action_size = len(self.action_scale)
         self._joint_of_servo = torch.tensor(
             [int(joint) - 1 for joint in model.actuator_trnid[:, 0]], device=self.device
         )

@@ -22,6 +22,13 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "memory": {"name": "remembering:Remembering"},
     "go1": {"name": "go1_velocity"},
     "g1": {"name": "g1_velocity"},
+    "tracking": {
+        "name": "g1_tracking",
+        "action_about": "reference",
+        "layout": "no_state_estimation",
+        "future_frames": [2],
+        "failure": "pelvis",
+    },
     "disturbances": {"name": "cartpole"},
     "legs": {
         "name": "myoleg26",
@@ -34,7 +41,7 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
 }
 
 ENCODERS = {"encoder_bias": {"*": {"uniform": 0.015}}}
-RANDOMIZED = {"disturbances": DISTURBANCES, "go1": ENCODERS, "g1": ENCODERS}
+RANDOMIZED = {"disturbances": DISTURBANCES, "go1": ENCODERS, "g1": ENCODERS, "tracking": ENCODERS}
 
 
 def _modules_calling() -> Iterator[str]:

@@ -8,13 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tracked_motion import write_recorded_motion
 
 from msk_ray.cli import run
 from msk_ray.config import load_config
+from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.__main__ import main
 from msk_ray.evaluate.stored import read_evaluations
-from msk_ray.robots.mjlab.scoring import task_of
+from msk_ray.robots.mjlab.scoring import mjlab_actions, motion_of, task_of
+from msk_ray.robots.tracking.env import G1Tracking
 from msk_ray.training import Trainer, load_policy
 
 pytestmark = pytest.mark.long
@@ -165,6 +168,27 @@ def test_a_class_derived_from_a_robot_is_not_that_robot() -> None:
         task_of(config.model_copy(update={"env": other}))
 
 
+def test_a_policy_that_follows_a_clip_has_mjlabs_layout_and_actions() -> None:
+    config = load_config("g1_tracking", ["env.action_range=2.0"])
+    assert task_of(config) == "Mjlab-Tracking-Flat-Unitree-G1"
+    other = load_config("g1_tracking", ["env.layout=no_state_estimation", "env.action_about=default"])
+    assert task_of(other) == "Mjlab-Tracking-Flat-Unitree-G1-No-State-Estimation"
+    with pytest.raises(ConfigError, match=r"not with env.future_frames"):
+        task_of(load_config("g1_tracking", ["env.future_frames=[1]"]))
+    env = make_env(config.env, config.physics, 2, "cpu", 0, differentiable=False)
+    assert isinstance(env, G1Tracking)
+    obs, action = env.observation().numpy(), np.linspace(-1.0, 1.0, 58, dtype=np.float32).reshape(2, 29)
+    expected = env.mjlab_action(torch.from_numpy(action)).numpy()
+    np.testing.assert_allclose(mjlab_actions(config)(obs, action), expected, atol=1e-5)
+    np.testing.assert_allclose(mjlab_actions(other)(obs, action), action)
+    with motion_of(config) as motion:
+        assert motion is not None
+        with np.load(motion) as arrays:
+            assert arrays["body_pos_w"].shape == (200, 30, 3)
+    with motion_of(load_config("go1_velocity")) as motion:
+        assert motion is None
+
+
 def _own_python(root: Path) -> Path:
     python = root / ".mjlab" / "bin" / "python"
     if not python.is_file():
@@ -185,6 +209,9 @@ def test_in_mjlab_itself(trial: Path, root: Path) -> None:
 def test_what_is_recorded_from_mjlab_is_what_it_gives(root: Path, tmp_path: Path) -> None:
     python, fixtures = _own_python(root), root / "tests" / "fixtures" / "mjlab"
     subprocess.run([str(python), str(fixtures / "record.py"), str(tmp_path), str(tmp_path)], check=True)
+    motion = tmp_path / "squat.npz"
+    write_recorded_motion(motion)
+    subprocess.run([str(python), str(fixtures / "record_tracking.py"), str(motion), str(tmp_path)], check=True)
     scenes = root / "msk_ray" / "robots" / "scenes"
     for file in scenes.glob("*.xml"):
         assert (tmp_path / file.name).read_text() == file.read_text()

@@ -7,7 +7,8 @@ MJLAB = ForeignScoring(
     package="mjlab",
     version="1.6",
     requirement="mjlab==1.6.0",
-    summary="mjlab: a policy of go1_velocity, go1_velocity_rough or g1_velocity in mjlab 1.6's own task, with its "
-    "settings for playing, and then with training's pushes and noise; 256 episodes of 20 s on a GPU, 8 on a CPU",
+    summary="mjlab: a policy of go1_velocity, go1_velocity_rough, g1_velocity or g1_tracking (one clip) in mjlab 1.6's "
+    "own task, with its settings for playing, and then with training's pushes and noise; 256 episodes of 20 s on a "
+    "GPU, 8 on a CPU",
     scorer_class="msk_ray.robots.mjlab.scoring:MjlabScorer",
 )

@@ -1,31 +1,42 @@
-"""`evaluate --in mjlab`: a policy in mjlab's unmodified velocity task, in a Python of its own.
+"""`evaluate --in mjlab`: a policy in mjlab's unmodified velocity or tracking task, in a Python of its own.
 
 mjlab 1.6 needs MuJoCo 3.11 and msk_ray 4.0, so one environment cannot hold both.
 
 Axes: W worlds, O observation, J actions.
 """
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from msk_ray.config import Config
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.foreign_process import ForeignProcess
 from msk_ray.evaluate.measure import EvaluationSetup, Request, entry_of
-from msk_ray.robots.config import VelocitySettings
+from msk_ray.robots.config import ServoSettings
 from msk_ray.robots.mjlab import worker
 from msk_ray.robots.mjlab.elsewhere import MJLAB
+from msk_ray.robots.servos import action_scale_of
+from msk_ray.robots.tracking.config import G1TrackingSettings
+from msk_ray.robots.tracking.env import G1Tracking
+from msk_ray.robots.tracking.motions import Clip, read_motions
 from msk_ray.training import SavedPolicy
 from msk_ray.training.episodes import Episodes
 from msk_ray.training.threads import use_threads
+
+Observations = NDArray[np.float32]
 
 TASKS: Final = {
     "go1_velocity": "Mjlab-Velocity-Flat-Unitree-Go1",
     "go1_velocity_rough": "Mjlab-Velocity-Rough-Unitree-Go1",
     "g1_velocity": "Mjlab-Velocity-Flat-Unitree-G1",
+    "g1_tracking": "Mjlab-Tracking-Flat-Unitree-G1",
 }
 """By name, because a class derived from one of these may be another robot with as many joints."""
 PLAY: Final = "mjlab play"
@@ -46,12 +57,54 @@ def task_of(config: Config) -> str:
     task = TASKS.get(env.name)
     if task is None:
         raise ConfigError(f"--in mjlab: env {env.name} is not a task of mjlab; train on one of {', '.join(TASKS)}")
-    if env.control_timestep != VelocitySettings.model_fields["control_timestep"].default:
+    if env.control_timestep != ServoSettings.model_fields["control_timestep"].default:
         raise ConfigError(
             f"--in mjlab: trained with a control step of {env.control_timestep:g} s, but mjlab's is 0.02 s; leave out "
             "env.control_timestep"
         )
+    if isinstance(env, G1TrackingSettings):
+        if env.future_frames or env.mirror:
+            raise ConfigError(
+                "--in mjlab: mjlab shows no future frames and follows one clip: not with "
+                f"env.{'future_frames' if env.future_frames else 'mirror'}"
+            )
+        task += {"full": "", "no_state_estimation": "-No-State-Estimation"}[env.layout]
     return task
+
+
+@contextmanager
+def motion_of(config: Config) -> Iterator[str | None]:
+    """A file with the clip that a policy follows, for mjlab; None if it follows none.
+
+    Raises:
+        ConfigError: it follows several.
+    """
+    env = config.env
+    if not isinstance(env, G1TrackingSettings):
+        yield None
+        return
+    model = G1Tracking.build_model(env, config.physics)
+    motions = read_motions(env.motion, model)
+    if len(motions) > 1:
+        raise ConfigError(f"--in mjlab: it follows one clip, not the {len(motions)} of env.motion {env.motion}")
+    motion = motions[0].at_rate(1.0 / env.control_timestep)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "motion.npz"
+        Clip.of(motion if env.cut is None else motion.cut(*env.cut), model).save(path)
+        yield str(path)
+
+
+def mjlab_actions(config: Config) -> Callable[[Observations, Observations], Observations]:
+    """A function from observations (W, O) and the policy's actions (W, J) for them to mjlab's actions."""
+    env = config.env
+    assert isinstance(env, ServoSettings)
+    scale = env.action_range
+    if not isinstance(env, G1TrackingSettings) or env.action_about == "default":
+        return lambda obs, action: scale * action
+    model = G1Tracking.build_model(env, config.physics)
+    pose, angles = model.key_qpos[0, 7:].astype(np.float32), action_scale_of(model).astype(np.float32)
+    # The observation begins with the reference's angles.
+    return lambda obs, action: scale * action + (obs[:, : len(pose)] - pose) / angles
 
 
 class MjlabScorer:
@@ -88,9 +141,10 @@ class MjlabScorer:
         seeds = request.seeds or (0,)
         asked = {"task": task, "pushed": request.physics == PUSHED, "worlds": request.worlds, "steps": request.steps}
         runs = []
-        for seed in seeds:
-            with _Worker(self._python, {**asked, "seed": seed}) as running:
-                runs.append(running.episodes(policy))
+        with motion_of(policy.config) as motion:
+            for seed in seeds:
+                with _Worker(self._python, {**asked, "seed": seed, "motion": motion}) as running:
+                    runs.append(running.episodes(policy))
         setup = EvaluationSetup(request.physics, False, request.worlds, seeds, request.steps, running.device)
         return entry_of(policy, setup, runs, running.terms) | {"mjlab": running.versions}
 
@@ -109,25 +163,27 @@ class _Worker(ForeignProcess):
         self.device: str = self.hello["device"]
         self.terms: list[str] = self.hello["terms"]
         self._observations: int = self.hello["observations"]
-        self._record = worker.record(self._observations, len(self.terms))
+        command = worker.followed(asked["motion"])
+        self._record = worker.record(self._observations, len(self.terms), command)
+        self._errors = worker.ERRORS[command]
 
     def episodes(self, policy: SavedPolicy) -> Episodes:
         """The first episode of each world."""
-        assert isinstance(policy.config.env, VelocitySettings)
-        worlds, scale = self._asked["worlds"], policy.config.env.action_range
+        worlds, actions = self._asked["worlds"], mjlab_actions(policy.config)
         obs = self.read(np.dtype(("<f4", (self._observations,))), worlds)
         running = np.ones(worlds, dtype=bool)
         fell = np.zeros(worlds, dtype=bool)
         length = np.zeros(worlds)
-        sums = {name: np.zeros((worlds, *self._record[name].shape)) for name in _SUMMED}
+        summed = ("reward", "terms", *self._errors)
+        sums = {name: np.zeros((worlds, *self._record[name].shape)) for name in summed}
         for _ in range(self._asked["steps"]):
-            self.write(scale * policy(obs))
+            self.write(actions(obs, policy(obs)))
             step = self.read(self._record, worlds)
             length += running
             ended = running & step["terminated"]
             for name, total in sums.items():
                 # A world that fell is elsewhere already when errors are measured.
-                counted = running & ~ended if name in worker.ERRORS else running
+                counted = running & ~ended if name in self._errors else running
                 total[counted] += step[name][counted]
             fell |= ended
             running &= ~ended
@@ -138,9 +194,6 @@ class _Worker(ForeignProcess):
             fell=torch.from_numpy(fell),
             diverged=torch.from_numpy(~np.isfinite(sums["reward"])),
             terms=torch.from_numpy(sums["terms"]),
-            outcomes={name: torch.from_numpy(sums[name]) for name in worker.ERRORS},
+            outcomes={name: torch.from_numpy(sums[name]) for name in self._errors},
             success=None,
         )
-
-
-_SUMMED: Final = ("reward", "terms", *worker.ERRORS)

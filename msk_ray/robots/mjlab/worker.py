@@ -1,9 +1,9 @@
-"""Runs episodes of an unmodified velocity task of mjlab for `scoring`, in a Python that has mjlab.
+"""Runs episodes of an unmodified task of mjlab for `scoring`, in a Python that has mjlab.
 
 That Python has other versions of MuJoCo and lacks this package, so this file imports nothing of it. It is started with
-one JSON argument {task, seed, worlds, steps, pushed}. On standard output it writes a line of JSON, which says what it
-runs, then the first observations, and a `record` after each step, of all worlds; on standard input it reads their
-actions before each step. mjlab's own messages go to standard error.
+one JSON argument {task, seed, worlds, steps, pushed, motion}. On standard output it writes a line of JSON, which says
+what it runs, then the first observations, and a `record` after each step, of all worlds; on standard input it reads
+their actions before each step. mjlab's own messages go to standard error.
 """
 
 import importlib.metadata
@@ -14,27 +14,47 @@ import sys
 import numpy as np
 
 PACKAGES = ("mjlab", "mujoco", "mujoco-warp", "torch")
-ERRORS = ("linear_error", "yaw_error")
+ERRORS = {"twist": ("linear_error", "yaw_error"), "motion": ("mpkpe", "r_mpkpe")}
+"""What is measured besides, by the command that is followed."""
 
 
-def record(observations: int, terms: int) -> np.dtype:
+def record(observations: int, terms: int, command: str) -> np.dtype:
     """What follows a step, for each world."""
     return np.dtype(
         [
             ("reward", "<f4"),
             ("terms", "<f4", (terms,)),
-            ("linear_error", "<f4"),
-            ("yaw_error", "<f4"),
+            *((name, "<f4") for name in ERRORS[command]),
             ("terminated", "?"),
             ("obs", "<f4", (observations,)),
         ]
     )
 
 
-def task_for_scoring(task: str, pushed: bool, worlds: int, seed: int, device: str):  # type: ignore[no-untyped-def]
-    """The environment of a task with mjlab's settings for playing, or with training's pushes and noise besides; and the
-    distances from the command, which are filled in each step."""
+def velocity_errors(env, command):  # type: ignore[no-untyped-def]
+    """Distances of the base's velocities from the command."""
     import torch
+
+    robot = env.scene["robot"].data
+    linear, angular = robot.root_link_lin_vel_b, robot.root_link_ang_vel_b
+    return {
+        "linear_error": torch.linalg.vector_norm(command.command[:, :2] - linear[:, :2], dim=-1),
+        "yaw_error": (command.command[:, 2] - angular[:, 2]).abs(),
+    }
+
+
+def motion_errors(env, command):  # type: ignore[no-untyped-def]
+    """Distances of the bodies from those of the motion."""
+    from mjlab.tasks.tracking.mdp.metrics import compute_mpkpe, compute_root_relative_mpkpe
+
+    return {"mpkpe": compute_mpkpe(command), "r_mpkpe": compute_root_relative_mpkpe(command)}
+
+
+def task_for_scoring(  # type: ignore[no-untyped-def]
+    task: str, pushed: bool, worlds: int, seed: int, device: str, motion: str | None = None
+):
+    """The environment of a task with mjlab's settings for playing, or with training's pushes and noise besides; and the
+    distances from the command, which are filled in each step. A task that follows a motion needs its file."""
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.tasks.registry import load_env_cfg
 
@@ -42,21 +62,27 @@ def task_for_scoring(task: str, pushed: bool, worlds: int, seed: int, device: st
     if pushed:
         cfg.events["push_robot"] = load_env_cfg(task).events["push_robot"]
         cfg.observations["actor"].enable_corruption = True
+    if motion is not None:
+        cfg.commands["motion"].motion_file = motion
     cfg.scene.num_envs, cfg.seed = worlds, seed
     env = ManagerBasedRlEnv(cfg, device)
-    robot, command = env.scene["robot"].data, env.command_manager.get_term("twist")
-    errors: dict[str, torch.Tensor] = {}
+    command = env.command_manager.get_term(followed(motion))
+    measure = velocity_errors if motion is None else motion_errors
+    errors: dict = {}
     update = command.compute
 
     def compute(*given, **named) -> None:  # type: ignore[no-untyped-def]
         # mjlab calls it when bodies are those of the end of the step; the command is still that of its start.
-        linear, angular = robot.root_link_lin_vel_b, robot.root_link_ang_vel_b
-        errors["linear_error"] = torch.linalg.vector_norm(command.command[:, :2] - linear[:, :2], dim=-1)
-        errors["yaw_error"] = (command.command[:, 2] - angular[:, 2]).abs()
+        errors.update(measure(env, command))
         update(*given, **named)
 
     command.compute = compute
     return env, errors
+
+
+def followed(motion: str | None) -> str:
+    """Name of the command."""
+    return "twist" if motion is None else "motion"
 
 
 def main() -> None:
@@ -70,7 +96,8 @@ def main() -> None:
 
     worlds = asked["worlds"]
     device = "cuda:0" if torch.cuda.is_available() else "cpu"
-    env, errors = task_for_scoring(asked["task"], asked["pushed"], worlds, asked["seed"], device)
+    motion = asked["motion"]
+    env, errors = task_for_scoring(asked["task"], asked["pushed"], worlds, asked["seed"], device, motion)
     obs, _ = env.reset()
     terms = env.reward_manager.active_terms
     observations, actions = obs["actor"].shape[1], env.action_manager.total_action_dim
@@ -84,7 +111,7 @@ def main() -> None:
     answers.write(json.dumps(hello).encode() + b"\n")
     answers.write(obs["actor"].cpu().numpy().astype("<f4").tobytes())
     answers.flush()
-    answer = np.zeros(worlds, record(observations, len(terms)))
+    answer = np.zeros(worlds, record(observations, len(terms), followed(motion)))
     for _ in range(asked["steps"]):
         given = np.frombuffer(sys.stdin.buffer.read(4 * worlds * actions), "<f4").reshape(worlds, actions)
         obs, reward, terminated, _, _ = env.step(torch.from_numpy(given.copy()).to(device))

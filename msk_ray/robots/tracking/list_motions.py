@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 List motions of Unitree's G1: their duration, frames, and what is wrong with them (joints beyond their ranges, parts in
-the ground). Files that are no motion of this robot are refused, each in one line.
+the ground or in other parts). Files that are no motion of this robot are refused, each in one line.
 
 Reads CSV with a frame a line at 30 Hz, as of Unitree's retargeted LAFAN1 (position, quaternion x, y, z, w, 29 joints),
 and NPZ of mjlab's csv_to_npz. Draws a strip with a row for each motion."""

@@ -36,11 +36,11 @@ _SLACK: Final = 0.02
 _OTHER_ORDER: Final = 0.5
 """Angle beyond a joint's range [rad] that is a sign of another order of joints, if a tenth of the frames have it."""
 _SUNK: Final = 0.03
-"""Depth in the ground from which it is told [m]."""
+"""Depth in the ground, or in another part of the robot, from which it is told [m]."""
 _TOGETHER: Final = 4096
 """Frames whose bodies are placed at once."""
 _LOOKED_AT: Final = 5
-"""The ground is looked for in every fifth frame."""
+"""Contacts are looked for in every fifth frame."""
 
 
 @dataclass(frozen=True)
@@ -282,25 +282,27 @@ def remarks(motion: Motion, model: mujoco.MjModel) -> list[str]:
         joint = int(excess.max(0).argmax())
         share = float((excess > _SLACK).any(1).mean())
         found.append(f"{model.joint(joint + 1).name} up to {worst:.2f} rad beyond its range, any joint in {share:.0%}")
-    depth = ground_depth(motion, model)
-    if (deepest := float(depth.max())) > _SUNK:
-        share = float((depth > _SUNK).mean())
-        found.append(f"up to {100.0 * deepest:.0f} cm in the ground, more than {100.0 * _SUNK:.0f} cm in {share:.0%}")
+    ground, itself = depths(motion, model).T
+    for depth, where in ((ground, "the ground"), (itself, "itself")):
+        if (deepest := float(depth.max())) > _SUNK:
+            share = float((depth > _SUNK).mean())
+            found.append(f"up to {100.0 * deepest:.0f} cm in {where}, over {100.0 * _SUNK:.0f} cm in {share:.0%}")
     return found
 
 
-def ground_depth(motion: Motion, model: mujoco.MjModel) -> Array:
-    """Depth of the robot's deepest part in the ground [m], in every fifth frame; 0 above it."""
+def depths(motion: Motion, model: mujoco.MjModel) -> Array:
+    """How deep the robot is in the ground, and parts of it in each other [m], in every fifth frame, (F / 5, 2)."""
     data = mujoco.MjData(model)
     fixed = model.body_weldid[model.geom_bodyid] == 0
-    depths = []
+    found = []
     for qpos in motion.qpos[::_LOOKED_AT]:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
-        with_ground = fixed[data.contact.geom].any(-1) if data.ncon else np.zeros(0, bool)
-        depths.append(max(0.0, *(-data.contact.dist[with_ground])) if with_ground.any() else 0.0)
-    return np.array(depths)
+        contact = data.contact
+        on_ground = fixed[contact.geom].any(-1) if data.ncon else np.zeros(0, bool)
+        found.append([max((0.0, *(-contact.dist[chosen]))) for chosen in (on_ground, ~on_ground)])
+    return np.array(found)
 
 
 def slerp(start: Array, end: Array, share: Array) -> Array:

@@ -146,3 +146,8 @@ def test_remarks_tell_of_ranges_and_of_the_ground(model: mujoco.MjModel, squat: 
     bent[:10, 14] = 0.6  # waist_pitch_joint, range 0.52
     (remark,) = remarks(replace(squat, joints=bent), model)
     assert remark == "waist_pitch_joint up to 0.08 rad beyond its range, any joint in 8%"
+    crossed = squat.joints.copy()
+    crossed[:, 1], crossed[:, 7] = -0.3, 0.3  # hips roll the legs into each other
+    crossed_legs = replace(squat, joints=crossed, position=np.add(squat.position, (0.0, 0.0, 0.5)))
+    (remark,) = remarks(crossed_legs, model)
+    assert remark.endswith("cm in itself, over 3 cm in 100%")

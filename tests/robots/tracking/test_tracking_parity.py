@@ -1,6 +1,6 @@
 """Observation, rewards, ends of episodes and metrics against those recorded from unmodified mjlab 1.6.0.
 
-`tests/fixtures/mjlab/record_tracking.py` has recorded them, with the motion that `write_motion` writes.
+`tests/fixtures/mjlab/record_tracking.py` has recorded them, with the motion that `tracked_motion` writes.
 """
 
 from pathlib import Path
@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from tracked_motion import CUT
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.envs.records import EnvState
 from msk_ray.robots.tracking.env import G1Tracking
-from msk_ray.robots.tracking.motions import Clip, read_motions
 from msk_ray.step import StepState
 
 RECORDED = Path(__file__).parents[2] / "fixtures" / "mjlab" / "g1_tracking_steps.npz"
-CUT = (0.0, 1.2)
-"""Part of `builtin:squat` that was followed [s]."""
 
 
 def make(count: int, **changes: object) -> G1Tracking:
@@ -28,13 +26,6 @@ def make(count: int, **changes: object) -> G1Tracking:
     env = make_env(settings, PhysicsConfig(), count, "cpu", 0, differentiable=False)
     assert isinstance(env, G1Tracking)
     return env
-
-
-def write_motion(path: str) -> None:
-    """Write the motion for `record_tracking.py`."""
-    model = make(1).model
-    (motion,) = read_motions("builtin:squat", model)
-    Clip.of(motion.at_rate(50.0).cut(*CUT), model).save(Path(path))
 
 
 class Recorded:
