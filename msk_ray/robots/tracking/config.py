@@ -6,7 +6,7 @@ from pydantic import Field, model_validator
 
 from msk_ray.config.rewards import reward_section, with_reward
 from msk_ray.config.schedules import CostSchedule, cost_share
-from msk_ray.config.sections import Count, Fraction, NonNegative, Reward, Section, Text
+from msk_ray.config.sections import Count, Fraction, NonNegative, Reward, Text
 from msk_ray.config.terms import Term, terms_in
 from msk_ray.robots.config import ServoSettings
 
@@ -21,20 +21,6 @@ class TrackingShape(Reward):
     tail: Fraction = 0.0
     """Share of 1/(1 + x) in the six terms of the motion, which are e^−x in scores: that has no slope far from it. For
     training."""
-
-
-class AdaptiveSampling(Section):
-    """How starts of episodes are drawn more often where they have failed."""
-
-    uniform: Fraction = 0.1
-    """Share of the starts that are drawn anywhere. mjlab adds 0.1 to the failures of all worlds in a step instead, so
-    that its share depends on their number."""
-    alpha: Annotated[float, Field(gt=0.0, le=1.0)] = 0.001
-    """Share of the newest env step in the mean of failures."""
-    kernel: Annotated[int, Field(ge=1, le=60)] = 1
-    """Seconds before a failure whose starts it makes likelier."""
-    decay: Fraction = 0.8
-    """What is left of that from one second to the one before."""
 
 
 TRACKING_TERMS = terms_in(
@@ -73,9 +59,8 @@ class G1TrackingSettings(ServoSettings):
     """Follow each motion's mirror image too."""
     layout: Literal["full", "no_state_estimation"] = "full"
     """What the policy sees: `full` has the position of the anchor and the velocity of the IMU, which a robot cannot
-    measure; mjlab calls the other one so. The critic sees all of it."""
-    critic_bodies: bool = True
-    """Whether the critic also sees position and orientation of all tracked bodies, as in mjlab."""
+    measure; mjlab calls the other one so. The critic sees all of it, and position and
+    orientation of all tracked bodies."""
     future_frames: tuple[Offset, ...] = ()
     """Env steps ahead whose reference the policy sees too, such as [1, 2, 4, 8]."""
     action_about: Literal["default", "reference"] = "default"
@@ -85,7 +70,6 @@ class G1TrackingSettings(ServoSettings):
     (`uniform`), or with the first frame of each motion (`start`)."""
     score_sampling: Literal["uniform", "start"] = "uniform"
     """The same for scores."""
-    adaptive: AdaptiveSampling = AdaptiveSampling()
     failure: Failure = "mjlab"
     """When an episode of training ends early: as in mjlab (height or tilt of the torso, or the height of a hand or
     foot, is far off), or by height and tilt of the `pelvis` alone."""
@@ -100,9 +84,3 @@ class G1TrackingSettings(ServoSettings):
         if self.cut is not None and self.cut[0] >= self.cut[1]:
             raise ValueError(f"env.cut: {self.cut[0]:g} to {self.cut[1]:g} s is no part of a motion")
         return self
-
-    def unread(self) -> dict[str, str]:
-        if self.sampling == "adaptive":
-            return super().unread()
-        unread = {f"adaptive.{name}": f"env.sampling is {self.sampling}" for name in AdaptiveSampling.model_fields}
-        return {**super().unread(), **unread}

@@ -97,7 +97,7 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         self._ends = torch.tensor([self.bodies.index(body) for body in self.ends], device=self.device)
         library = library_of(Source.of(config, self.model, self.bodies))
         self.references = References(library, self._anchor, self.device)
-        self.start_frames = StartFrames(self.references, rate, config.sampling, config.adaptive)
+        self.start_frames = StartFrames(self.references, rate, config.sampling)
         self._pose_noise = config.reset_noise * self.tensor(_POSE_NOISE)
         self._velocity_noise = config.reset_velocity_noise * self.tensor(_VELOCITY_NOISE)
         self._joint_noise = config.reset_noise * _JOINT_NOISE
@@ -263,18 +263,11 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
 
     # Observation
 
-    @property
-    def asymmetric(self) -> bool:
-        own = self.config.layout != "full" or self.config.critic_bodies
-        return own or self.disturbances.of_observations
-
     def observe(self, state: StepState, action: Tensor) -> Tensor:
         return self._observed(state, full=self.config.layout == "full")
 
     def observe_critic(self, state: StepState, action: Tensor) -> Tensor:
         seen = self._observed(state, full=True)
-        if not self.config.critic_bodies:
-            return seen
         frames = self.frames(state)
         position, orientation = frames.position(self.bodies), frames.orientation(self.bodies)
         anchor = self._anchor

@@ -15,8 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from msk_ray.robots.tracking.config import AdaptiveSampling, G1TrackingSettings, Sampling
+from msk_ray.robots.tracking.config import G1TrackingSettings, Sampling
 from msk_ray.robots.tracking.motions import BUILTIN, Clip, body_names, motion_files, read_motions
+
+_ANYWHERE = 0.1
+"""Share of adaptive starts that are drawn anywhere. mjlab adds 0.1 to the failures of all worlds in a step instead, so
+that its share depends on their number."""
+_NEWEST = 0.001
+"""Share of the newest env step in the mean of failures."""
 
 
 class Library(NamedTuple):
@@ -133,22 +139,21 @@ class References:
 class StartFrames:
     """Draws the frames in which episodes begin.
 
-    Clips are cut into seconds. An adaptive draw prefers those in which episodes have failed, or those before them: mean
-    failures per env step are kept in a tensor that is changed in place, so that recorded epochs count too.
+    Clips are cut into seconds. An adaptive draw prefers those in which episodes have failed: mean failures per env step
+    are kept in a tensor that is changed in place, so that recorded epochs count too.
 
     Args:
         references: the clips.
         rate: frames per second [1/s].
         sampling: how to draw.
-        adaptive: settings of adaptive draws.
 
     Attributes:
         failures: in each second, per env step, (S,).
     """
 
-    def __init__(self, references: References, rate: float, sampling: Sampling, adaptive: AdaptiveSampling) -> None:
+    def __init__(self, references: References, rate: float, sampling: Sampling) -> None:
         device = references.firsts.device
-        self._sampling, self._adaptive = sampling, adaptive
+        self._sampling = sampling
         self._references = references
         counts = [math.floor(length / rate) + 1 for length in references.lengths]
         clip = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
@@ -164,11 +169,6 @@ class StartFrames:
             for first, count, length in zip(firsts, counts, references.lengths, strict=True)
         ]
         self._bin_of = torch.from_numpy(np.concatenate(frames)).to(device)
-        after = torch.arange(len(clip))[:, None] + torch.arange(adaptive.kernel)
-        last_of_clip = torch.from_numpy(firsts)[clip] + of_clip - 1
-        self._after = torch.minimum(after, last_of_clip[:, None]).to(device)
-        weights = adaptive.decay ** torch.arange(adaptive.kernel, dtype=torch.float32)
-        self._kernel = (weights / weights.sum()).to(device)
         self._share = (self._width / self._width.sum()).to(device)
         self.failures = torch.zeros(len(clip), device=device)
 
@@ -176,10 +176,9 @@ class StartFrames:
         """The chance of each second, (S,)."""
         if self._sampling != "adaptive":
             return self._share
-        before = self.failures[self._after] @ self._kernel
-        uniform = self._adaptive.uniform
-        preferred = uniform * self._share + (1.0 - uniform) * before / before.sum().clamp_min(1e-12)
-        return torch.where(before.sum() > 0.0, preferred, self._share)
+        total = self.failures.sum()
+        preferred = _ANYWHERE * self._share + (1.0 - _ANYWHERE) * self.failures / total.clamp_min(1e-12)
+        return torch.where(total > 0.0, preferred, self._share)
 
     def draw(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """First and last frames of episodes, each (N,) int64, from uniform numbers in [0, 1), (N, 2)."""
@@ -200,4 +199,4 @@ class StartFrames:
     @torch.no_grad()
     def count(self, failed: Tensor) -> None:
         """Add an env step's failures (S,) to the mean."""
-        self.failures.lerp_(failed, self._adaptive.alpha)
+        self.failures.lerp_(failed, _NEWEST)
