@@ -1,6 +1,6 @@
 """Whatever lies where a record should be, every command answers in one line, soon, and shows what is whole.
 
-The consequences are those of the table "Damaged and hostile records" in docs/runner/faults.md.
+The consequences are those of the table "Damaged and hostile records" in lab/faults.md.
 """
 
 import contextlib
