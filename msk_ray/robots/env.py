@@ -76,7 +76,6 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     Settings = VelocitySettings  # type: ignore[assignment]
     commands = (VELOCITY,)
-    begin_epoch_in_place = True
 
     def prepare(self) -> None:
         super().prepare()
@@ -89,8 +88,8 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         self._start_range = _START.to(self.device)
         self._widest = self.command_ranges["velocity"][:, :3].clone()
 
-    def begin_epoch(self, epoch: int) -> None:
-        super().begin_epoch(epoch)
+    def apply_schedules(self, epoch: int) -> None:
+        super().apply_schedules(epoch)
         if (schedule := self.config.command_schedule) is not None:
             torch.mul(self._widest, schedule.at(epoch), out=self.command_ranges["velocity"][:, :3])
 

@@ -15,7 +15,7 @@ from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
 from msk_ray.robots.config import G1_TERMS
-from msk_ray.robots.env import VelocityEnv
+from msk_ray.robots.env import Go1Velocity, VelocityEnv
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1
 from msk_ray.robots.rough import Go1VelocityRough
@@ -122,7 +122,7 @@ def test_costs_rise_in_training_alone() -> None:
     names = [term.name for term, cost in zip(env.active_terms, costs, strict=True) if not cost]
     assert names == ["track_linear_velocity", "track_angular_velocity", "upright", "pose", "dof_pos_limits"]
     assert env.weighted_terms.shares.tolist() == [1.0] * len(costs)  # as in scores, which begin no epoch
-    env.begin_epoch(0)
+    env.enter_epoch(0)
     assert env.weighted_terms.shares.tolist() == pytest.approx([0.1 if cost else 1.0 for cost in costs])
 
 
@@ -130,11 +130,31 @@ def test_commands_widen_in_training_alone() -> None:
     env = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
     scored = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
     for epoch, share in ((0, 0.5), (150, 0.75), (200, 1.0)):
-        env.begin_epoch(epoch)
+        env.enter_epoch(epoch)
         low, high = env.command_ranges["velocity"][:, :4].tolist()
         assert low == pytest.approx([-1.5 * share, -share, -0.7 * share, -math.pi], rel=1e-6)
         assert high == pytest.approx([2.0 * share, share, 0.7 * share, math.pi], rel=1e-6)
     assert scored.command_ranges["velocity"][1, 0] == 2.0
+
+
+class Curriculum(Go1Velocity):
+    """Has a curriculum of its own."""
+
+    begin_epoch_in_place = True
+
+    def begin_epoch(self, epoch: int) -> None:
+        self.command_ranges["velocity"][1, 1] = 0.25
+
+
+def test_a_class_with_its_own_curriculum_keeps_the_schedules_of_costs_and_commands() -> None:
+    schedules = {
+        "cost_schedule": CostSchedule(start=0.1, begin=5, end=9),
+        "command_schedule": CommandSchedule(start=0.5, begin=5, end=9),
+    }
+    env = Curriculum(Curriculum.Settings(name="own", **schedules), PhysicsConfig(), 1, "cpu", 0, None)
+    env.enter_epoch(0)
+    assert env.weighted_terms.shares.amin().item() == pytest.approx(0.1)
+    assert env.command_ranges["velocity"][1, :3].tolist() == pytest.approx([1.0, 0.25, 0.35])
 
 
 def test_costs_that_never_rise_are_refused() -> None:
