@@ -161,7 +161,10 @@ class Task(ABC, Generic[SettingsT]):
         return None
 
     def remember(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
-        """All memories, (W, size), once `action` has led to `state`. Called once a step, before `observe`."""
+        """All memories, (W, size), once `action` has led to `state`. Called once a step, before `observe`.
+
+        `self.observation()` is what the policy was given when it chose `action`, with its errors and delays.
+        """
         return {}
 
     @abstractmethod

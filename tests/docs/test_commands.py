@@ -76,12 +76,6 @@ def test_the_code_on_identification_finds_the_damping(capsys: pytest.CaptureFixt
     assert found["guess"].exp().item() == pytest.approx(0.03, rel=0.02)
 
 
-def test_the_code_on_muscles_has_a_gradient(capsys: pytest.CaptureFixture[str]) -> None:
-    found: dict[str, Any] = {}
-    exec(code_of("legs/muscles.md"), found)
-    assert found["excitation"].grad.item() > 0.01
-
-
 TINY = (
     *("env.nworld=4", "shac.horizon=4", "shac.critic_iterations=1", "shac.critic_batches=1", "trial.epochs=2"),
     *("evaluation.interval=1", "evaluation.nworld=2", "evaluation.steps=5", "actor.hidden=[8]", "critic.hidden=[8]"),

@@ -104,6 +104,18 @@ def test_its_commands_and_programs_run(
     _compare_observation(follow)
 
 
+def test_its_history_holds_what_the_policy_was_given(folder: Path) -> None:
+    config = load_config("my_robot.yaml")
+    assert config.physics.randomize is not None
+    env = make_env(config.env, config.physics, 4, "cpu", 0, differentiable=False, randomize=True)
+    size, before = 6 + 3 * env.action_size, env.observation()
+    for _ in range(5):
+        obs = env.step(torch.zeros(4, env.action_size)).obs
+        assert torch.equal(obs[:, size : 4 * size], before[:, : 3 * size])
+        before = obs
+    assert not torch.equal(before, env.observe(env.state.physics, env.state.action))
+
+
 def _compare_observation(follow: dict[str, Any]) -> None:
     """The last observation of the program is that of the environment in the same state."""
     config = load_config("my_robot.yaml")

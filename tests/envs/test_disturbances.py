@@ -159,6 +159,48 @@ def test_each_episode_has_a_delay_of_its_own_even_where_ages_are_spread() -> Non
     assert set(delays[-1].tolist()) == {0, 1, 2}
 
 
+def recalling(**randomize: Any) -> Env[Any]:
+    config = parse_config({"env": {"name": "disturbed:Recalling"}})
+    physics = PhysicsConfig.model_validate({"randomize": randomize or None})
+    return make_env(config.env, physics, W, "cpu", 0, randomize=True)
+
+
+@pytest.mark.parametrize("delay", [[0, 0], [0, 2]])
+def test_a_history_holds_what_the_policy_was_given_then(delay: list[int]) -> None:
+    errors = {name: {"*": {"uniform": 0.1}} for name in ("observation_noise", "observation_bias")}
+    env = recalling(observation_delay=delay, **errors)
+    given = [torch.zeros(W, 5), torch.zeros(W, 5), env.observation()[:, :5]]
+    for _ in range(6):
+        obs = env.step(torch.zeros(W, 1)).obs
+        assert torch.equal(obs, env.observation())
+        given.append(obs[:, :5])
+        assert torch.equal(obs[:, 5:], torch.cat((given[-2], given[-3]), dim=-1))
+    assert (given[-1] - clean(env)[:, :5]).abs().amin() > 0.0
+
+
+def test_one_sensor_has_one_bias_in_all_frames_and_scores_have_none() -> None:
+    env, plain = recalling(observation_bias={"*": {"uniform": 0.1}}), recalling()
+    for _ in range(3):
+        env.step(torch.zeros(W, 1))
+        plain.step(torch.zeros(W, 1))
+    error = (env.observation() - plain.observation()).unflatten(-1, (3, 5))
+    torch.testing.assert_close(error, error[:, :1].expand_as(error), atol=1e-6, rtol=0.0)
+    assert error.abs().amax() > 0.09
+    assert torch.equal(plain.observation(), clean(plain))
+
+
+def test_gradients_flow_through_a_history_with_errors() -> None:
+    env, plain = recalling(observation_noise={"*": {"uniform": 0.1}}), recalling()
+    gradients = []
+    for each in (env, plain):
+        first = torch.zeros(W, 1, requires_grad=True)
+        each.step(first)
+        obs = each.step(torch.zeros(W, 1)).obs
+        gradients.append(torch.autograd.grad(obs[:, 5:].sum(), first)[0])
+    assert torch.equal(*gradients)
+    assert gradients[0].abs().amin() > 0.0
+
+
 def test_late_controls_act_later_with_their_gradient() -> None:
     env, prompt = cartpole(control_delay=[2, 2]), cartpole()
     actions = [torch.full((W, 1), 0.1 * (step + 1), requires_grad=True) for step in range(5)]

@@ -23,6 +23,7 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "go1": {"name": "go1_velocity"},
     "g1": {"name": "g1_velocity"},
     "disturbances": {"name": "cartpole"},
+    "history": {"name": "disturbed:Recalling"},
     "legs": {
         "name": "myoleg26",
         "clock": True,
@@ -34,7 +35,7 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
 }
 
 ENCODERS = {"encoder_bias": {"*": {"uniform": 0.015}}}
-RANDOMIZED = {"disturbances": DISTURBANCES, "go1": ENCODERS, "g1": ENCODERS}
+RANDOMIZED = {"disturbances": DISTURBANCES, "history": DISTURBANCES, "go1": ENCODERS, "g1": ENCODERS}
 
 
 def _modules_calling() -> Iterator[str]:
