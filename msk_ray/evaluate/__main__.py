@@ -73,8 +73,8 @@ def parser() -> Parser:
         "--with",
         dest="conditions",
         metavar="LIST",
-        help="comma-separated harder conditions, evaluated in addition to the usual one: push and weak for legs, and "
-        "uphill, downhill and rough on myoleg26",
+        help="comma-separated harder conditions, evaluated in addition to the usual one: disturbed (by the trial's own "
+        "physics.randomize), push and weak for legs, and uphill, downhill and rough on myoleg26",
     )
     p.add_argument(
         "--in",
