@@ -66,7 +66,7 @@ def parser() -> Parser:
         "--physics",
         metavar="LIST",
         help="comma-separated: reference (used for scores), own (used in training), or names from the environment "
-        "(default: reference)",
+        "(default: reference, which is own where the environment names no physics)",
     )
     p.add_argument("--vary", metavar="FIELD=LIST", help=HELP)
     p.add_argument(
