@@ -1,6 +1,7 @@
 """The velocity tasks beyond what mjlab's recorded steps show: starts, shares of commands, gradients."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from msk_ray.config import CommandSchedule, CostSchedule, PhysicsConfig
 from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
-from msk_ray.robots.config import G1_TERMS
+from msk_ray.robots.config import G1_TERMS, GO1_TERMS
 from msk_ray.robots.env import Go1Velocity, VelocityEnv
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1
@@ -241,6 +242,53 @@ def test_a_model_whose_joints_cannot_be_moved_is_refused(joint: str, servo: str,
     )
     with pytest.raises(ConfigError, match=message):
         servos_of(mujoco.MjModel.from_xml_string(xml))
+
+
+def changed(edits: dict[str, str], **attributes: Any) -> Own:
+    """A user's robot whose MJCF is Go1's with other texts."""
+    text = (SCENES / "go1_flat.xml").read_text()
+    for pattern, new in edits.items():
+        text, count = re.subn(pattern, new, text, flags=re.DOTALL)
+        assert count, pattern
+    kind = type("Changed", (Own,), {"mjcf": text, "terms": GO1_TERMS, **attributes})
+    return kind(kind.Settings(name="changed"), PhysicsConfig(), 1, "cpu", 0, None)
+
+
+def test_a_robot_without_a_default_pose_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"model of Changed has no keyframe .* write in the MJCF <keyframe>.* 19 numbers"
+    ):
+        changed({"<keyframe>.*</keyframe>": "", '<size nkey="1"/>': ""})
+
+
+def test_a_default_pose_outside_the_range_of_a_joint_is_refused() -> None:
+    message = (
+        r"default pose of Changed: joint 'FR_hip_joint' is at 0.1 rad, outside its range -0.01506 to 0.01506 rad, and "
+        r'so are 11 others: .*degrees unless <compiler angle="radian"/>'
+    )
+    with pytest.raises(ConfigError, match=message):
+        changed({'<compiler angle="radian"/>': ""})
+
+
+def test_all_names_that_a_model_lacks_are_said_at_once() -> None:
+    wrong = replace(GO1, base="pelvis", feet=("FR", "left", "right"), foot_parts=("toe",))
+    edits = {'body name="terrain"': 'body name="floor"', 'body2="terrain"': 'body2="floor"', 'name="imu_ang_vel"': ""}
+    with pytest.raises(ConfigError) as refused:
+        changed(edits, robot=wrong)
+    assert re.fullmatch(
+        r"the model of Changed lacks what its robot names: no body 'pelvis', 'terrain' \(with the ground\) "
+        r"\(it has world, floor, trunk, .*\); no site 'left', 'right' \(it has head, imu, FR, FL, RR, RL\); "
+        r"no geom 'toe' \(it has terrain, .*\.\.\.\); no sensor 'imu_ang_vel' \(gyro\) \(it has imu_lin_vel, .*\)",
+        str(refused.value),
+    )
+
+
+def test_sensors_are_needed_by_those_that_observe_them() -> None:
+    without = {'name="imu_ang_vel"': "", 'name="imu_lin_vel"': ""}
+    with pytest.raises(ConfigError, match=r"no sensor 'imu_lin_vel' \(velocimeter\), 'imu_ang_vel' \(gyro\)"):
+        changed(without)
+    env = changed(without, observe=lambda self, state, action: state.qpos)
+    assert torch.isfinite(env.step(torch.zeros(1, 12)).reward).all()
 
 
 def test_episodes_end_at_a_low_base_in_training_alone() -> None:
