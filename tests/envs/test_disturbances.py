@@ -17,6 +17,7 @@ from msk_ray.envs.disturbances import uniform_hash
 from msk_ray.envs.layout import Entry
 from msk_ray.errors import ConfigError
 from msk_ray.group import Group
+from msk_ray.step import StepState
 from msk_ray.training import Trainer
 from msk_ray.training.evaluation import Evaluator
 
@@ -326,6 +327,25 @@ def test_a_biased_joint_has_to_be_in_the_observation() -> None:
     )
     with pytest.raises(ConfigError, match="does not show joint 'slider' as slider_angle or slider_position"):
         make_env(trial.env, trial.physics, 2, "cpu", 0, randomize=True)
+
+
+class Twofold(CartPole):
+    """Observes everything twice, under names as long as a robot's."""
+
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        return super().observe(state, action).repeat(1, 2)
+
+    def observation_layout(self) -> list[Entry]:
+        return [Entry(f"{entry.name}_{'of_a_joint_' * 10}", "") for entry in super().observation_layout()] * 2
+
+
+def test_names_that_no_pattern_means_are_listed_once_and_not_all() -> None:
+    trial = parse_config({"env": {"name": f"{__name__}:Twofold"}})
+    physics = PhysicsConfig.model_validate({"randomize": {"observation_noise": {"hip": {"uniform": 0.1}}}})
+    with pytest.raises(ConfigError, match="no entry of the observation is 'hip'; it has cart_position") as refused:
+        make_env(trial.env, physics, 2, "cpu", 0, randomize=True)
+    assert str(refused.value).count("cart_position") == 1
+    assert len(str(refused.value)) < 500
 
 
 class Unnamed(CartPole):
