@@ -96,7 +96,7 @@ class Algorithm(ABC):
             ConfigError: the algorithm has `counts_episodes`, but returned no count.
             SimulationError: as `update`.
         """
-        self.env.begin_epoch(epoch)
+        self.env.enter_epoch(epoch)
         result = self.update(epoch)
         if self.counts_episodes and result.episodes is None:
             raise ConfigError(f"{type(self).__name__} has counts_episodes = True: return EpochResult(..., episodes=N)")

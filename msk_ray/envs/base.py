@@ -249,6 +249,11 @@ class Env(Task[SettingsT]):
             return self._draw(draw, shape).repeat(self.policies, *[1] * (len(shape) - 1))
         return draw(shape, generator=self.generator, device=self.generator.device).to(self.device)
 
+    def enter_epoch(self, epoch: int) -> None:
+        """Be as a training epoch, counted from 0, is to begin."""
+        self.apply_schedules(epoch)
+        self.begin_epoch(epoch)
+
     # One step
 
     def step(self, action: Tensor, *, auto_reset: bool = True) -> Transition:

@@ -4,7 +4,7 @@ kicks.
 All of it is a function of numbers that are drawn when an episode begins, of the episode's age, and of memories: a step
 draws nothing, so that it gives the same observation as often as it is asked.
 
-Axes: W worlds, O observation, D numbers drawn for an episode.
+Axes: W worlds, O observation, M its entries that memories do not give, D numbers drawn for an episode.
 """
 
 import math
@@ -19,6 +19,7 @@ from msk_ray.config import Push, RandomizeConfig
 from msk_ray.config.randomize import UNDISTURBED
 from msk_ray.envs.commands import Draws
 from msk_ray.envs.generators import seed_stream
+from msk_ray.envs.layout import Entry
 from msk_ray.envs.memory import Memory
 from msk_ray.envs.observation_errors import UNIFORM_BITS, EncoderErrors, EntryErrors
 from msk_ray.envs.records import EnvState
@@ -58,7 +59,11 @@ class Disturbances:
         self._env, self._first = env, first
         self.generator = torch.Generator(device=env.device)
         self.seed(seed)
-        names = _entry_names(config, env)
+        layout = _layout(config, env)
+        self._layout_size = len(layout)
+        measured = [place for place, entry in enumerate(layout) if not entry.remembered]
+        names = [layout[place].name for place in measured]
+        self._measured = None if len(measured) == len(layout) else torch.tensor(measured, device=env.device)
         self._noise = EntryErrors("observation_noise", config.observation_noise, names, env.device)
         self._bias = EntryErrors("observation_bias", config.observation_bias, names, env.device)
         self._encoders = EncoderErrors(config.encoder_bias, env.model, names, env.device)
@@ -80,7 +85,7 @@ class Disturbances:
             "push": 0 if self._kicks is None else self._kicks.size,
         }
         self.size = sum(widths.values())
-        self._entry_count = len(names)
+        self._measured_count = len(names)
         self.of_observations = bool(names)
         self._widths = widths
 
@@ -95,7 +100,7 @@ class Disturbances:
     def memories(self) -> dict[str, Memory]:
         """Memories of its own, with the gradients that late observations and controls have."""
         late = {
-            _OBSERVATIONS: _most(self._observation_delay) * self._entry_count,
+            _OBSERVATIONS: _most(self._observation_delay) * self._measured_count,
             _CONTROLS: (_most(self._control_delay) + (self._substep_delay is not None)) * self._env.model.nu,
         }
         kept = {name: Memory(size, gradient=True) for name, size in late.items() if size}
@@ -106,7 +111,7 @@ class Disturbances:
         env, memory = self._env, before.memory
         newest: dict[str, Tensor] = {}
         if _OBSERVATIONS in memory:
-            newest[_OBSERVATIONS] = env.observe(before.physics, before.action)
+            newest[_OBSERVATIONS] = self._measured_of(env.observe(before.physics, before.action))
         if _CONTROLS in memory:
             newest[_CONTROLS] = env.control(action)
         if not newest:
@@ -141,11 +146,21 @@ class Disturbances:
 
     def observation(self, obs: Tensor, state: EnvState) -> Tensor:
         """What the policy is given (W, O) in `state`, which the environment observes as `obs`."""
-        if self._entry_count and obs.shape[-1] != self._entry_count:
+        if self._layout_size and obs.shape[-1] != self._layout_size:
             raise ConfigError(
-                f"observation_layout of {type(self._env).__qualname__} names {self._entry_count} entries of an "
+                f"observation_layout of {type(self._env).__qualname__} names {self._layout_size} entries of an "
                 f"observation of {obs.shape[-1]}: name each"
             )
+        if self._measured is None:
+            return self._disturbed(obs, state)
+        return obs.index_copy(1, self._measured, self._disturbed(self._measured_of(obs), state))
+
+    def _measured_of(self, obs: Tensor) -> Tensor:
+        """Those entries (W, M) of observations (W, O) that memories do not give."""
+        return obs if self._measured is None else obs.index_select(1, self._measured)
+
+    def _disturbed(self, obs: Tensor, state: EnvState) -> Tensor:
+        """Measured entries (W, M) with their delay and errors."""
         age = state.age
         if self._observation_delay is not None:
             late = self._possible(self._drawn(self._observation_delay, state, "observation_delay"), state)
@@ -231,8 +246,8 @@ def _of_earlier(current: Tensor, earlier: Tensor | None, late: Tensor) -> Tensor
     return chosen
 
 
-def _entry_names(config: RandomizeConfig, env: "Env[Any]") -> list[str]:
-    """Names of all entries of the observation, if a setting needs them."""
+def _layout(config: RandomizeConfig, env: "Env[Any]") -> list[Entry]:
+    """All entries of the observation, if a setting needs them."""
     observed = ("observation_noise", "observation_bias", "encoder_bias", "observation_delay")
     needing = [name for name in observed if getattr(config, name) is not None]
     if not needing:
@@ -243,7 +258,7 @@ def _entry_names(config: RandomizeConfig, env: "Env[Any]") -> list[str]:
             f"physics.randomize.{needing[0]}: {type(env).__qualname__} does not name the entries of its observation: "
             "write its method observation_layout"
         )
-    return [entry.name for entry in layout]
+    return layout
 
 
 def _kicked(push: Push, model: mujoco.MjModel) -> Iterator[tuple[int, float]]:

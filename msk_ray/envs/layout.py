@@ -10,11 +10,18 @@ class Entry(NamedTuple):
     name: str
     unit: str
     """Unit of the number as it stands there; empty if it has none."""
+    remembered: bool = False
+    """Whether it is shown as a memory has it: errors and delays of observations leave it as it is."""
 
 
 def entries(names: Iterable[str], unit: str = "") -> list[Entry]:
     """Entries of one unit."""
     return [Entry(name, unit) for name in names]
+
+
+def remembered(shown: Iterable[Entry]) -> list[Entry]:
+    """The same entries as memories have them, such as frames of a history."""
+    return [entry._replace(remembered=True) for entry in shown]
 
 
 def each(names: Iterable[str], what: str, unit: str = "") -> list[Entry]:

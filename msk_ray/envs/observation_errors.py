@@ -12,10 +12,12 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import Spread
-from msk_ray.errors import ConfigError
+from msk_ray.errors import ConfigError, shortened
 
 UNIFORM_BITS = 24
 """Bits of a uniform number in float32."""
+_LISTED = 400
+"""Characters of names that an error lists."""
 
 
 class EntryErrors:
@@ -144,7 +146,8 @@ def _chosen(setting: str, spreads: Mapping[str, Spread], names: list[str], kind:
     for pattern, spread in spreads.items():
         matching = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
         if not matching:
-            raise ConfigError(f"{key}: no {kind} is {pattern!r}; it has {', '.join(names)}")
+            known = shortened(", ".join(dict.fromkeys(names)), _LISTED)
+            raise ConfigError(f"{key}: no {kind} is {pattern!r}; it has {known}")
         for which in matching:
             if which in taken:
                 raise ConfigError(f"{key}: {names[which]!r} is both {taken[which]!r} and {pattern!r}; leave one out")

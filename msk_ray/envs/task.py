@@ -109,13 +109,17 @@ class Task(ABC, Generic[SettingsT]):
         """The setting, if any, because of which `end_epoch` has to know how long episodes were."""
         return None
 
+    def apply_schedules(self, epoch: int) -> None:
+        """Set, in place, what settings let depend on the epoch: called before `begin_epoch`, so that a class with its
+        own keeps them. A class with such a setting extends it, with `super()`."""
+        self.weighted_terms.begin_epoch(self.config, epoch)
+
     def begin_epoch(self, epoch: int) -> None:
         """Called before each training epoch, counted from 0: change here what depends on the progress of training.
 
         Keep what changes in tensors, change them in place and set `begin_epoch_in_place`: a recorded epoch reads
-        tensors again each time, but a number only once. Call this one too: it sets the schedules of terms.
+        tensors again each time, but a number only once.
         """
-        self.weighted_terms.begin_epoch(self.config, epoch)
 
     def end_epoch(self, length: float | None) -> dict[str, float]:
         """Called after each training epoch with its env steps per episode that ended, if known; figures for logs."""
@@ -157,7 +161,10 @@ class Task(ABC, Generic[SettingsT]):
         return None
 
     def remember(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
-        """All memories, (W, size), once `action` has led to `state`. Called once a step, before `observe`."""
+        """All memories, (W, size), once `action` has led to `state`. Called once a step, before `observe`.
+
+        `self.observation()` is what the policy was given when it chose `action`, with its errors and delays.
+        """
         return {}
 
     @abstractmethod

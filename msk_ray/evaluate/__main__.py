@@ -47,6 +47,7 @@ EXAMPLES = """\
   python -m msk_ray.evaluate ant_lr --worlds 256 --seeds 0-4             # fresh initial states
   python -m msk_ray.evaluate runs/mine --vary body_mass=0.8x,1.2x        # how well does it work with other masses?
   python -m msk_ray.evaluate runs/train/myoleg26_seed0 --with push,uphill,rough,weak   # how robust is it?
+  python -m msk_ray.evaluate runs/mine --with disturbed                  # under the noise and pushes of its training
   python -m msk_ray.evaluate runs/train/myosuite_walk_seed0 --in myosuite   # in MyoSuite's own environment
   python -m msk_ray.evaluate policies/                                   # do the trained policies score as recorded?
 
@@ -66,15 +67,15 @@ def parser() -> Parser:
         "--physics",
         metavar="LIST",
         help="comma-separated: reference (used for scores), own (used in training), or names from the environment "
-        "(default: reference)",
+        "(default: reference, which is own where the environment names no physics)",
     )
     p.add_argument("--vary", metavar="FIELD=LIST", help=HELP)
     p.add_argument(
         "--with",
         dest="conditions",
         metavar="LIST",
-        help="comma-separated harder conditions, evaluated in addition to the usual one: push and weak for legs, and "
-        "uphill, downhill and rough on myoleg26",
+        help="comma-separated harder conditions, evaluated in addition to the usual one: disturbed (by the trial's own "
+        "physics.randomize), push and weak for legs, and uphill, downhill and rough on myoleg26",
     )
     p.add_argument(
         "--in",

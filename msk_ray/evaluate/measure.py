@@ -22,6 +22,8 @@ from msk_ray.training.machine import device_name
 from msk_ray.training.out_of_memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
+DISTURBED = "disturbed"
+"""The condition of a trial that it trains under, its `physics.randomize`."""
 _PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
 
 
@@ -37,19 +39,22 @@ class Request:
     varied: RandomizeConfig | None = None
     """Parameters of the model to change."""
     condition: str | None = None
-    """One of the environment's `conditions`, which make the task harder."""
+    """One of the environment's `conditions`, which make the task harder, or `DISTURBED`."""
 
 
 def under_condition(config: Config, name: str) -> tuple[Config, RandomizeConfig | None]:
-    """A config changed to one of its environment's conditions, and the parameters of the model that it changes.
+    """A config changed to one of its environment's conditions, and what is drawn under it.
 
     Raises:
-        ConfigError: the environment has no such condition.
+        ConfigError: there is no such condition.
     """
-    known = config.env.conditions
+    known, drawn = config.env.conditions, config.physics.randomize
+    if name == DISTURBED and drawn is not None:
+        return config, drawn
     if name not in known:
-        there = f"has {', '.join(known)}; write one of these, or leave it out" if known else "has none; leave it out"
-        raise ConfigError(f"--with {name}: env {config.env.name} {there}")
+        there = [*known, *([DISTURBED] if drawn is not None else [])]
+        instead = f"has {', '.join(there)}; write one of these, or leave it out" if there else "has none; leave it out"
+        raise ConfigError(f"--with {name}: a trial of env {config.env.name} {instead}")
     values = {key: value for key, value in known[name].items() if key != "physics.randomize"}
     harder = parse_config(overlay(config.as_dict(), values)) if values else config
     varied = known[name].get("physics.randomize")
@@ -111,8 +116,10 @@ class Bench:
         return self._evaluators[key], shown if request.varied is None else f"{shown}, {request.varied}"
 
     def check(self, config: Config, request: Request) -> None:
-        """Raise ConfigError if a trial's environment does not have the requested physics, or its model not the
-        parameter to change. Runs nothing."""
+        """Raise ConfigError if a trial's environment does not have the requested physics or condition, or its model
+        not the parameter to change. Runs nothing."""
+        if request.condition is not None:
+            under_condition(config, request.condition)
         _, physics = named_physics(config, request.physics)
         if request.varied is None:
             return

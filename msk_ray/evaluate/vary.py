@@ -51,7 +51,7 @@ def vary_text(entries: Sequence[dict[str, Any]]) -> str:
     Args:
         entries: of one policy; the first is with the unchanged model.
     """
-    own = entries[0]["score"]["mean"]
+    own, outcomes = entries[0]["score"]["mean"], list(entries[0]["outcomes"])
     rows = [
         (
             entry["physics"],
@@ -60,7 +60,8 @@ def vary_text(entries: Sequence[dict[str, Any]]) -> str:
             f"{entry['score']['mean'] / own:.0%}" if own > 0.0 else "-",
             f"{entry['length']['mean']:.0f}",
             f"{entry['fall_rate']:.0%}",
+            *(f"{entry['outcomes'][name]['mean']:.3g}" for name in outcomes),
         )
         for entry in entries
     ]
-    return text_table(("physics", "score", "std", "of its own", "length", "fell"), rows, 120)
+    return text_table(("physics", "score", "std", "of its own", "length", "fell", *outcomes), rows, 120)

@@ -57,7 +57,9 @@ def describe(
         "outputs": policy.outputs,
         "observation": {
             "size": len(given),
-            "entries": None if layout is None else [layout[place]._asdict() for place in given],
+            "entries": None
+            if layout is None
+            else [{"name": layout[place].name, "unit": layout[place].unit} for place in given],
             "description": _own_docstring(type(env)),
         },
         "action": {"size": env.action_size, "range": [-1.0, 1.0], "names": env.action_names()},

@@ -134,15 +134,14 @@ class AssistedEnv(Env[AnySettings], Generic[AnySettings]):
         assistance: how much is left of them; to be set in `prepare`.
     """
 
-    begin_epoch_in_place = True
     assistance: Assistance
 
     @property
     def reads_episode_lengths(self) -> str | None:
         return self.assistance.reads_episode_lengths
 
-    def begin_epoch(self, epoch: int) -> None:
-        super().begin_epoch(epoch)
+    def apply_schedules(self, epoch: int) -> None:
+        super().apply_schedules(epoch)
         self.assistance.begin_epoch(epoch)
 
     def end_epoch(self, length: float | None) -> dict[str, float]:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from msk_ray.envs.layout import Entry, each, entries, vector
 from msk_ray.envs.memory import Memory
+from msk_ray.errors import ConfigError
 from msk_ray.robots.config import (
     G1_TERMS,
     GO1_TERMS,
@@ -20,6 +21,7 @@ from msk_ray.robots.config import (
     Go1VelocitySettings,
     VelocitySettings,
 )
+from msk_ray.robots.mjcf_check import GROUND, missing, missing_parts
 from msk_ray.robots.robot import by_joint
 from msk_ray.robots.robots import G1, GO1
 from msk_ray.robots.servos import ServoEnv
@@ -43,6 +45,10 @@ _SLOWEST_AHEAD = 0.3
 """Smallest command straight ahead [m/s]."""
 _HEADING_STIFFNESS = 0.5
 """Yaw rate asked for per error of the heading [1/s]."""
+
+
+_SENSORS = {"imu_lin_vel": "velocimeter", "imu_ang_vel": "gyro", "root_angmom": "subtreeangmom"}
+"""Sensors of the observation and, the last, of the term `angular_momentum`."""
 
 
 class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
@@ -76,9 +82,9 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     Settings = VelocitySettings  # type: ignore[assignment]
     commands = (VELOCITY,)
-    begin_epoch_in_place = True
 
     def prepare(self) -> None:
+        self._check_names()
         super().prepare()
         self.default_height = self._start.qpos[0, 2]
         spread = self.robot.pose_spread
@@ -89,8 +95,21 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         self._start_range = _START.to(self.device)
         self._widest = self.command_ranges["velocity"][:, :3].clone()
 
-    def begin_epoch(self, epoch: int) -> None:
-        super().begin_epoch(epoch)
+    def _check_names(self) -> None:
+        """Raise ConfigError if the model lacks any of the names of `robot`, saying all that are missing.
+
+        Sensors are for `observe`, which a class may write without them.
+        """
+        terms = {term.name for term in self.active_terms}
+        wanted = {name: kind for name, kind in _SENSORS.items() if name != "root_angmom" or "angular_momentum" in terms}
+        sensors = missing("sensor", wanted, self.model)
+        self._no_sensors = sensors and f"the model of {type(self).__qualname__} has {sensors}"
+        if parts := missing_parts(self.robot, self.model):
+            every = "; ".join([*parts, *([sensors] if sensors else [])])
+            raise ConfigError(f"the model of {type(self).__qualname__} lacks what its robot names: {every}")
+
+    def apply_schedules(self, epoch: int) -> None:
+        super().apply_schedules(epoch)
         if (schedule := self.config.command_schedule) is not None:
             torch.mul(self._widest, schedule.at(epoch), out=self.command_ranges["velocity"][:, :3])
 
@@ -172,7 +191,7 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     def foot_contact(self, state: StepState) -> Contact:
         """What the feet have touched of the ground in the step that led to `state`."""
-        return self.contact(state, self.robot.foot_parts, self.robot.foot_kind, "terrain", "body")
+        return self.contact(state, self.robot.foot_parts, self.robot.foot_kind, GROUND, "body")
 
     def air_time(self) -> AirTime:
         """Times of the feet in the air and on the ground [s], each (W, F), at the end of the step."""
@@ -212,6 +231,8 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     # Observation
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
+        if self._no_sensors:
+            raise ConfigError(self._no_sensors)
         sensors = self.sensors(state)
         return torch.cat(
             (

@@ -15,6 +15,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.mjcf.env import MjcfEnv
 from msk_ray.errors import ConfigError
 from msk_ray.robots.config import ServoSettings
+from msk_ray.robots.mjcf_check import check_default_pose
 from msk_ray.robots.robot import Robot
 from msk_ray.step import StepState
 from msk_ray.step.autograd.tangent import quat_conjugate, quat_rotate
@@ -72,6 +73,7 @@ class ServoEnv(MjcfEnv[AnyServoSettings], Generic[AnyServoSettings]):
     def prepare(self) -> None:
         model = self.model
         self.joint_names = [model.joint(joint).name for joint in range(1, model.njnt)]
+        check_default_pose(type(self).__qualname__, model, self._start.qpos[0].tolist() if model.nkey else None)
         self.default_pose = self._start.qpos[0, 7:]
         self.action_scale = self.tensor(action_scale_of(model))
         self.action_size = len(self.action_scale)

@@ -36,7 +36,7 @@ class Evaluator:
         config: the trial's config; its `evaluation` section sets worlds, steps and seed.
         device: "cpu" or "cuda:N".
         physics: physics to use instead of the reference.
-        varied: model parameters to override. Randomization in training does not apply here.
+        varied: what to draw instead of `physics.randomize`, which does not apply here.
         policies: number of policies that can run at the same time, each in its own `evaluation.nworld` worlds.
     """
 
@@ -160,7 +160,7 @@ class Evaluator:
         """The episodes of each policy; at most `policies` of them."""
         env = self.env
         before = self._generators.state()
-        env.generator.manual_seed(self._seed if seed is None else seed)
+        env.seed(self._seed if seed is None else seed)
         self._reset()
         policy = PolicyGroup(policies, self._worlds, env, self._streams)
         tally = Tally(env, len(policies), self._worlds)

@@ -51,7 +51,7 @@ def test_an_algorithm_keeps_its_promise_to_count(tiny_cartpole: Config) -> None:
         action_size=1,
         device=torch.device("cpu"),
         reads_episode_lengths=None,
-        begin_epoch=lambda epoch: None,
+        enter_epoch=lambda epoch: None,
         end_epoch=lambda length: {"length": length},
     )
     assert Silent(tiny_cartpole, env).run_epoch(0).metrics == {"length": None}

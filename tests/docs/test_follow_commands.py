@@ -83,11 +83,11 @@ def test_its_commands_and_programs_run(
     monkeypatch.setattr("msk_ray.play.__main__._screen", blind)
     done = []
     for name, words in commands_of(page):
-        if name == "visualize":  # pictures have tests of their own
+        if "--video" in words:  # pictures have tests of their own
             words = [*words[: words.index("--video")], "--no-render"]
         assert commands.main([name, *words, *SMALLER[name]]) == 0, (name, capsys.readouterr().err)
         done.append(name)
-    assert done == ["gradcheck", "play", "train", "evaluate", "play", "visualize", "export"]
+    assert done == ["gradcheck", "play", "train", "evaluate", "play", "visualize", "visualize", "export"]
     said = capsys.readouterr().out
     assert re.search(r"episode 1: score .*, 0\.0 s, time", said)
     kept = "    state = data.qpos.copy(), data.qvel.copy()\n"
@@ -102,6 +102,32 @@ def test_its_commands_and_programs_run(
     assert follow["data"].qpos[2] > 0.2, "it stands, as its policy hardly moves"
     assert capsys.readouterr().out.startswith("after 9.0 s at x = ")
     _compare_observation(follow)
+
+
+def test_the_go1_of_the_package_goes_where_the_page_says(
+    page: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert commands.main(["export", "go1_velocity", "--onnx", "my_robot.onnx"]) == 0
+    program = Path("follow.py").read_text()
+    Path("follow.py").write_text(program.replace("((gyro,", '((data.sensor("imu_lin_vel").data, gyro,'))
+    runpy.run_path("follow.py")
+    place = re.compile(r"at x\s=\s(-?\d\S*)\sm,\sy\s=\s(-?\d\S*)\sm,\sz\s=\s(-?\d\S*)\sm")
+    said, expected = (place.search(text) for text in (capsys.readouterr().out, page.read_text()))
+    assert said is not None
+    assert expected is not None
+    assert [float(x) for x in said.groups()] == pytest.approx([float(x) for x in expected.groups()], abs=0.2)
+
+
+def test_its_history_holds_what_the_policy_was_given(folder: Path) -> None:
+    config = load_config("my_robot.yaml")
+    assert config.physics.randomize is not None
+    env = make_env(config.env, config.physics, 4, "cpu", 0, differentiable=False, randomize=True)
+    size, before = 6 + 3 * env.action_size, env.observation()
+    for _ in range(5):
+        obs = env.step(torch.zeros(4, env.action_size)).obs
+        assert torch.equal(obs[:, size : 4 * size], before[:, : 3 * size])
+        before = obs
+    assert not torch.equal(before, env.observe(env.state.physics, env.state.action))
 
 
 def _compare_observation(follow: dict[str, Any]) -> None:

@@ -17,6 +17,7 @@ from msk_ray.envs.disturbances import uniform_hash
 from msk_ray.envs.layout import Entry
 from msk_ray.errors import ConfigError
 from msk_ray.group import Group
+from msk_ray.step import StepState
 from msk_ray.training import Trainer
 from msk_ray.training.evaluation import Evaluator
 
@@ -159,6 +160,48 @@ def test_each_episode_has_a_delay_of_its_own_even_where_ages_are_spread() -> Non
     assert set(delays[-1].tolist()) == {0, 1, 2}
 
 
+def recalling(**randomize: Any) -> Env[Any]:
+    config = parse_config({"env": {"name": "disturbed:Recalling"}})
+    physics = PhysicsConfig.model_validate({"randomize": randomize or None})
+    return make_env(config.env, physics, W, "cpu", 0, randomize=True)
+
+
+@pytest.mark.parametrize("delay", [[0, 0], [0, 2]])
+def test_a_history_holds_what_the_policy_was_given_then(delay: list[int]) -> None:
+    errors = {name: {"*": {"uniform": 0.1}} for name in ("observation_noise", "observation_bias")}
+    env = recalling(observation_delay=delay, **errors)
+    given = [torch.zeros(W, 5), torch.zeros(W, 5), env.observation()[:, :5]]
+    for _ in range(6):
+        obs = env.step(torch.zeros(W, 1)).obs
+        assert torch.equal(obs, env.observation())
+        given.append(obs[:, :5])
+        assert torch.equal(obs[:, 5:], torch.cat((given[-2], given[-3]), dim=-1))
+    assert (given[-1] - clean(env)[:, :5]).abs().amin() > 0.0
+
+
+def test_one_sensor_has_one_bias_in_all_frames_and_scores_have_none() -> None:
+    env, plain = recalling(observation_bias={"*": {"uniform": 0.1}}), recalling()
+    for _ in range(3):
+        env.step(torch.zeros(W, 1))
+        plain.step(torch.zeros(W, 1))
+    error = (env.observation() - plain.observation()).unflatten(-1, (3, 5))
+    torch.testing.assert_close(error, error[:, :1].expand_as(error), atol=1e-6, rtol=0.0)
+    assert error.abs().amax() > 0.09
+    assert torch.equal(plain.observation(), clean(plain))
+
+
+def test_gradients_flow_through_a_history_with_errors() -> None:
+    env, plain = recalling(observation_noise={"*": {"uniform": 0.1}}), recalling()
+    gradients = []
+    for each in (env, plain):
+        first = torch.zeros(W, 1, requires_grad=True)
+        each.step(first)
+        obs = each.step(torch.zeros(W, 1)).obs
+        gradients.append(torch.autograd.grad(obs[:, 5:].sum(), first)[0])
+    assert torch.equal(*gradients)
+    assert gradients[0].abs().amin() > 0.0
+
+
 def test_late_controls_act_later_with_their_gradient() -> None:
     env, prompt = cartpole(control_delay=[2, 2]), cartpole()
     actions = [torch.full((W, 1), 0.1 * (step + 1), requires_grad=True) for step in range(5)]
@@ -284,6 +327,25 @@ def test_a_biased_joint_has_to_be_in_the_observation() -> None:
     )
     with pytest.raises(ConfigError, match="does not show joint 'slider' as slider_angle or slider_position"):
         make_env(trial.env, trial.physics, 2, "cpu", 0, randomize=True)
+
+
+class Twofold(CartPole):
+    """Observes everything twice, under names as long as a robot's."""
+
+    def observe(self, state: StepState, action: Tensor) -> Tensor:
+        return super().observe(state, action).repeat(1, 2)
+
+    def observation_layout(self) -> list[Entry]:
+        return [Entry(f"{entry.name}_{'of_a_joint_' * 10}", "") for entry in super().observation_layout()] * 2
+
+
+def test_names_that_no_pattern_means_are_listed_once_and_not_all() -> None:
+    trial = parse_config({"env": {"name": f"{__name__}:Twofold"}})
+    physics = PhysicsConfig.model_validate({"randomize": {"observation_noise": {"hip": {"uniform": 0.1}}}})
+    with pytest.raises(ConfigError, match="no entry of the observation is 'hip'; it has cart_position") as refused:
+        make_env(trial.env, physics, 2, "cpu", 0, randomize=True)
+    assert str(refused.value).count("cart_position") == 1
+    assert len(str(refused.value)) < 500
 
 
 class Unnamed(CartPole):

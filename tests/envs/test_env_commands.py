@@ -51,7 +51,6 @@ class Widening(Rod):
     begin_epoch_in_place = True
 
     def begin_epoch(self, epoch: int) -> None:
-        super().begin_epoch(epoch)
         self.command_ranges["pace"][1, 0] = 3.0 + epoch
 
 

@@ -127,7 +127,7 @@ def test_an_ants_cost_of_joint_ranges_fades() -> None:
     joints = [0.0, math.radians(100.0) + 0.2, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0]
     state = StepState(torch.tensor([[0.0, 0, 0.77, 1, 0, 0, 0, *joints]]), torch.zeros(1, 14), torch.zeros(1, 0))
     for epoch, share in ((0, 1.0), (10, 0.5), (20, 0.0), (30, 0.0)):
-        env.begin_epoch(epoch)
+        env.enter_epoch(epoch)
         found = named_terms(env, state, torch.zeros(1, 8))["joint_limit"].item()
         assert found == pytest.approx(-2.0 * share, rel=1e-4)
 
@@ -148,7 +148,7 @@ def test_other_bodies_pay_for_joints_past_their_ranges_too(name: str) -> None:
     qpos[0, at[0]] = ranges[0, 1] + 0.1
     state = StepState(qpos, torch.zeros(1, env.model.nv), torch.zeros(1, 0))
     for epoch, share in ((0, 1.0), (10, 0.5), (20, 0.0)):
-        env.begin_epoch(epoch)
+        env.enter_epoch(epoch)
         found = named_terms(env, state, torch.zeros(1, env.action_size))
         assert list(found)[-1] == "joint_limit"
         assert found["joint_limit"].item() == pytest.approx(-2.5 * share, rel=1e-4)

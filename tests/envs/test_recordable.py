@@ -30,6 +30,7 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
         "failure": "pelvis",
     },
     "disturbances": {"name": "cartpole"},
+    "history": {"name": "disturbed:Recalling"},
     "legs": {
         "name": "myoleg26",
         "clock": True,
@@ -41,7 +42,13 @@ ENVIRONMENTS: dict[str, dict[str, Any]] = {
 }
 
 ENCODERS = {"encoder_bias": {"*": {"uniform": 0.015}}}
-RANDOMIZED = {"disturbances": DISTURBANCES, "go1": ENCODERS, "g1": ENCODERS, "tracking": ENCODERS}
+RANDOMIZED = {
+    "disturbances": DISTURBANCES,
+    "history": DISTURBANCES,
+    "go1": ENCODERS,
+    "g1": ENCODERS,
+    "tracking": ENCODERS,
+}
 
 
 def _modules_calling() -> Iterator[str]:

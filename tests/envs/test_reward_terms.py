@@ -106,7 +106,7 @@ def test_a_term_is_weight_times_value_and_an_optional_one_is_there_where_it_has_
     env = make("More", sensor=True, reward={"near": 4.0, "width": 1.0, "effort_cost": 2.0, "steady": 0.0})
     near = 4.0 * torch.tensor(-4.0).exp().item()
     assert terms_of(env) == pytest.approx({"forward": 3.0, "near": near, "effort": -0.5, "steady": 0.0})
-    env.begin_epoch(2)
+    env.enter_epoch(2)
     assert terms_of(env) == pytest.approx({"forward": 3.0, "near": near / 4.0, "effort": -0.5, "steady": 0.0})
     reference = env.reference_settings(env.config)
     assert reference.reward == type(env).Settings(name="listed:More").reward

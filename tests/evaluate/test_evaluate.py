@@ -3,15 +3,17 @@
 import argparse
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from disturbed import DISTURBANCES
 
 from msk_ray.cli import positive, run
-from msk_ray.config import parse_config
+from msk_ray.config import overlay, parse_config
 from msk_ray.errors import CheckpointError
 from msk_ray.evaluate.__main__ import main
 from msk_ray.evaluate.measure import Bench, Request, figures
@@ -19,7 +21,7 @@ from msk_ray.evaluate.stored import read_evaluations, store_evaluation
 from msk_ray.experiment.attempts import Attempt, WorldReduction
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.records import best_records, read_records
-from msk_ray.training import load_policy, read_metrics
+from msk_ray.training import Trainer, load_policy, read_metrics
 from msk_ray.training.checkpoint import milestones
 from msk_ray.training.episodes import Episodes
 
@@ -53,6 +55,38 @@ def test_the_score_is_the_one_trials_are_ranked_by_and_the_same_twice(trial: Pat
         k: v for k, v in best.items() if k.startswith("eval/term/")
     }
     assert math.isclose(sum(v["mean"] for v in first["terms"].values()), first["score"]["mean"], rel_tol=1e-5)
+
+
+def test_a_policy_can_be_scored_under_what_disturbed_it_in_training(
+    tiny_settings: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer = Trainer(parse_config(overlay(tiny_settings, {"physics.randomize": DISTURBANCES})), tmp_path, "cpu")
+    trainer.run_epoch()
+    trainer.close()
+    command = [str(tmp_path / "checkpoints" / "policy_000000.pt"), "--device", "cpu", "--with"]
+    assert run(main, [*command, "push,disturbed"]) == 2
+    assert "--with push: a trial of env cartpole has disturbed; write" in capsys.readouterr().err
+    assert not (tmp_path / "eval.json").exists(), "refused before the first step"
+    scores = []
+    for _ in range(2):
+        assert run(main, [*command, "disturbed"]) == 0
+        clean, disturbed = sorted(entries(tmp_path), key=lambda entry: str(entry["physics"]))
+        scores.append(disturbed["scores"])
+        assert (clean["physics"], disturbed["physics"]) == ("own", "own, disturbed")
+        assert clean["canonical"]
+        assert not disturbed["canonical"]
+        assert clean["scores"] != disturbed["scores"]
+    assert scores[0] == scores[1], "the same is drawn again"
+    assert re.search(r"length +fell +upright", capsys.readouterr().out)
+
+
+def test_a_trial_without_disturbances_or_conditions_is_not_scored_under_any(
+    trial: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (trial / "eval.json").unlink(missing_ok=True)
+    assert run(main, [str(trial), "--device", "cpu", "--with", "disturbed"]) == 2
+    assert "--with disturbed: a trial of env cartpole has none; leave it out" in capsys.readouterr().err
+    assert not (trial / "eval.json").exists()
 
 
 def test_seeds_worlds_and_steps(trial: Path) -> None:

@@ -108,7 +108,7 @@ def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.Ca
     assert all(f"own, {name}" in told for name in ("push", "weak"))
     stored = json.loads((tmp_path / "trial" / "eval.json").read_text())["evaluations"]
     assert {entry["physics"] for entry in stored} == {"own", "own, push", "own, weak"}
-    with pytest.raises(ConfigError, match="has push, weak, uphill, downhill, rough; write one of these"):
+    with pytest.raises(ConfigError, match=r"--with ice: a trial .* has push, weak, uphill, downhill, rough; write"):
         evaluate([str(tmp_path / "trial"), *shorter, "--with", "ice"])
     with pytest.raises(ConfigError, match="write positive numbers"):
         main([str(tmp_path / "trial"), "--speeds", "0.5,-1"])

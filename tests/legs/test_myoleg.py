@@ -237,6 +237,6 @@ def test_people_step_on_80_muscles_and_springs_right_the_pelvis() -> None:
     torque = quat_rotate(state.qpos[:, 3:7], force[:, 3:6])[0].numpy() @ axes.T
     assert torque == pytest.approx([0.0, -80.0, 0.0], abs=0.01)
     assert force[0, :3].numpy() @ axes.T == pytest.approx([0.0, -8.0, 0.0], abs=0.01)
-    env.begin_epoch(10)
+    env.enter_epoch(10)
     assert not env.applied_force(state).any()
     assert MyoLeg.reference_settings(config).assist.epochs == 0

@@ -247,7 +247,7 @@ def test_assistance_fades_and_the_score_is_free_of_it() -> None:
     helped.state = helped.state._replace(physics=state)
     forces = []
     for epoch in (0, 5, 10, 11):
-        helped.begin_epoch(epoch)
+        helped.enter_epoch(epoch)
         forces.append(helped.control(torch.zeros(1, 26))[0, 26:])
     assert forces[0][4].item() == pytest.approx(-80.0, rel=1e-4)
     assert torch.allclose(forces[1], 0.5 * forces[0])
@@ -273,13 +273,13 @@ def test_a_resumed_trial_has_the_springs_it_had() -> None:
     env.end_epoch(300.0)
     resumed.load_state_dict(env.state_dict())
     for each in (env, resumed):
-        each.begin_epoch(1)
+        each.enter_epoch(1)
         assert each.end_epoch(0.0) == {"train/assist": 0.75}
 
 
 def test_assistance_holds_the_trunk_and_does_not_ring() -> None:
     env = make(4, assist={"epochs": 10}, reset="mixed")
-    env.begin_epoch(0)
+    env.enter_epoch(0)
     generator = torch.Generator().manual_seed(0)
     for _ in range(60):
         env.step((torch.rand((4, 26), generator=generator) - 0.5) * 1.6, auto_reset=False)

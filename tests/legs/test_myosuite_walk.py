@@ -119,7 +119,7 @@ def test_springs_turn_the_pelvis_to_standing_and_fade() -> None:
     assert force[1].numpy() == pytest.approx([-80.0, 0.0, 0.0, 0.0, 0.0, -9.714, *[0.0] * 28], abs=1e-2)
     assert env.end_epoch(49.0) == {"train/assist": 1.0}
     assert env.end_epoch(51.0) == {"train/assist": 1.0}
-    env.begin_epoch(2)
+    env.enter_epoch(2)
     assert env.applied_force(StepState(q, v, act))[1, 0].item() == pytest.approx(-60.0)  # type: ignore[index]
     assert env.state_dict()["assist_epochs"] == 1
 

@@ -16,12 +16,13 @@ from msk_ray.export.network import PolicyToControl
 @pytest.fixture
 def folder(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder with the files of the page, and those of the page it builds on."""
-    before = {name: sys.modules.pop(name, None) for name in ("hopper", "tracker")}
+    before = {name: sys.modules.pop(name, None) for name in ("hopper", "tracker", "faster")}
     for page, name in (
         ("own_robot", "hopper.xml"),
         ("own_robot", "hopper.py"),
         ("own_robot", "hopper.yaml"),
         ("commands", "tracker.py"),
+        ("commands", "faster.py"),
     ):
         text = (root / "docs" / "runner" / f"{page}.md").read_text()
         found = re.search(rf"`{name}`:?\n\n```\w+\n(.*?)\n```", text, re.DOTALL)
@@ -50,3 +51,13 @@ def test_the_environment_of_the_page_follows_commands_remembers_and_carries_its_
     assert policy.inputs == ["obs", "memory_motor"]
     assert policy.gives_control
     assert not policy.remarks
+
+
+def test_its_curriculum_changes_commands_that_are_drawn_already(folder: Path) -> None:
+    config = load_config(folder / "hopper.yaml", ["env.name=faster:Faster"])
+    env = make_env(config.env, config.physics, 64, "cpu", 0)
+    before = env.command("speed")
+    env.enter_epoch(100)
+    assert env.command_ranges["speed"].tolist() == [[-0.5], [2.0]]
+    assert torch.allclose(env.command("speed"), -0.5 + (before + 0.5) * 2.5 / 1.5)
+    assert env.begin_epoch_in_place

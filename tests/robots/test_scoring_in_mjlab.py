@@ -171,7 +171,9 @@ def test_a_class_derived_from_a_robot_is_not_that_robot() -> None:
 def test_a_policy_that_follows_a_clip_has_mjlabs_layout_and_actions() -> None:
     config = load_config("g1_tracking", ["env.action_range=2.0"])
     assert task_of(config) == "Mjlab-Tracking-Flat-Unitree-G1"
-    other = load_config("g1_tracking", ["env.layout=no_state_estimation", "env.action_about=default"])
+    other = load_config(
+        "g1_tracking", ["env.layout=no_state_estimation", "env.action_about=default", "env.action_range=1.0"]
+    )
     assert task_of(other) == "Mjlab-Tracking-Flat-Unitree-G1-No-State-Estimation"
     with pytest.raises(ConfigError, match=r"not with env.future_frames"):
         task_of(load_config("g1_tracking", ["env.future_frames=[1]"]))

@@ -1,6 +1,7 @@
 """The velocity tasks beyond what mjlab's recorded steps show: starts, shares of commands, gradients."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,8 @@ from msk_ray.config import CommandSchedule, CostSchedule, PhysicsConfig
 from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
-from msk_ray.robots.config import G1_TERMS
-from msk_ray.robots.env import VelocityEnv
+from msk_ray.robots.config import G1_TERMS, GO1_TERMS
+from msk_ray.robots.env import Go1Velocity, VelocityEnv
 from msk_ray.robots.robot import PoseSpread, by_joint
 from msk_ray.robots.robots import GO1
 from msk_ray.robots.rough import Go1VelocityRough
@@ -122,7 +123,7 @@ def test_costs_rise_in_training_alone() -> None:
     names = [term.name for term, cost in zip(env.active_terms, costs, strict=True) if not cost]
     assert names == ["track_linear_velocity", "track_angular_velocity", "upright", "pose", "dof_pos_limits"]
     assert env.weighted_terms.shares.tolist() == [1.0] * len(costs)  # as in scores, which begin no epoch
-    env.begin_epoch(0)
+    env.enter_epoch(0)
     assert env.weighted_terms.shares.tolist() == pytest.approx([0.1 if cost else 1.0 for cost in costs])
 
 
@@ -130,11 +131,31 @@ def test_commands_widen_in_training_alone() -> None:
     env = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
     scored = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
     for epoch, share in ((0, 0.5), (150, 0.75), (200, 1.0)):
-        env.begin_epoch(epoch)
+        env.enter_epoch(epoch)
         low, high = env.command_ranges["velocity"][:, :4].tolist()
         assert low == pytest.approx([-1.5 * share, -share, -0.7 * share, -math.pi], rel=1e-6)
         assert high == pytest.approx([2.0 * share, share, 0.7 * share, math.pi], rel=1e-6)
     assert scored.command_ranges["velocity"][1, 0] == 2.0
+
+
+class Curriculum(Go1Velocity):
+    """Has a curriculum of its own."""
+
+    begin_epoch_in_place = True
+
+    def begin_epoch(self, epoch: int) -> None:
+        self.command_ranges["velocity"][1, 1] = 0.25
+
+
+def test_a_class_with_its_own_curriculum_keeps_the_schedules_of_costs_and_commands() -> None:
+    schedules = {
+        "cost_schedule": CostSchedule(start=0.1, begin=5, end=9),
+        "command_schedule": CommandSchedule(start=0.5, begin=5, end=9),
+    }
+    env = Curriculum(Curriculum.Settings(name="own", **schedules), PhysicsConfig(), 1, "cpu", 0, None)
+    env.enter_epoch(0)
+    assert env.weighted_terms.shares.amin().item() == pytest.approx(0.1)
+    assert env.command_ranges["velocity"][1, :3].tolist() == pytest.approx([1.0, 0.25, 0.35])
 
 
 def test_costs_that_never_rise_are_refused() -> None:
@@ -221,6 +242,53 @@ def test_a_model_whose_joints_cannot_be_moved_is_refused(joint: str, servo: str,
     )
     with pytest.raises(ConfigError, match=message):
         servos_of(mujoco.MjModel.from_xml_string(xml))
+
+
+def changed(edits: dict[str, str], **attributes: Any) -> Own:
+    """A user's robot whose MJCF is Go1's with other texts."""
+    text = (SCENES / "go1_flat.xml").read_text()
+    for pattern, new in edits.items():
+        text, count = re.subn(pattern, new, text, flags=re.DOTALL)
+        assert count, pattern
+    kind = type("Changed", (Own,), {"mjcf": text, "terms": GO1_TERMS, **attributes})
+    return kind(kind.Settings(name="changed"), PhysicsConfig(), 1, "cpu", 0, None)
+
+
+def test_a_robot_without_a_default_pose_is_refused() -> None:
+    with pytest.raises(
+        ConfigError, match=r"model of Changed has no keyframe .* write in the MJCF <keyframe>.* 19 numbers"
+    ):
+        changed({"<keyframe>.*</keyframe>": "", '<size nkey="1"/>': ""})
+
+
+def test_a_default_pose_outside_the_range_of_a_joint_is_refused() -> None:
+    message = (
+        r"default pose of Changed: joint 'FR_hip_joint' is at 0.1 rad, outside its range -0.01506 to 0.01506 rad, and "
+        r'so are 11 others: .*degrees unless <compiler angle="radian"/>'
+    )
+    with pytest.raises(ConfigError, match=message):
+        changed({'<compiler angle="radian"/>': ""})
+
+
+def test_all_names_that_a_model_lacks_are_said_at_once() -> None:
+    wrong = replace(GO1, base="pelvis", feet=("FR", "left", "right"), foot_parts=("toe",))
+    edits = {'body name="terrain"': 'body name="floor"', 'body2="terrain"': 'body2="floor"', 'name="imu_ang_vel"': ""}
+    with pytest.raises(ConfigError) as refused:
+        changed(edits, robot=wrong)
+    assert re.fullmatch(
+        r"the model of Changed lacks what its robot names: no body 'pelvis', 'terrain' \(with the ground\) "
+        r"\(it has world, floor, trunk, .*\); no site 'left', 'right' \(it has head, imu, FR, FL, RR, RL\); "
+        r"no geom 'toe' \(it has terrain, .*\.\.\.\); no sensor 'imu_ang_vel' \(gyro\) \(it has imu_lin_vel, .*\)",
+        str(refused.value),
+    )
+
+
+def test_sensors_are_needed_by_those_that_observe_them() -> None:
+    without = {'name="imu_ang_vel"': "", 'name="imu_lin_vel"': ""}
+    with pytest.raises(ConfigError, match=r"no sensor 'imu_lin_vel' \(velocimeter\), 'imu_ang_vel' \(gyro\)"):
+        changed(without)
+    env = changed(without, observe=lambda self, state, action: state.qpos)
+    assert torch.isfinite(env.step(torch.zeros(1, 12)).reward).all()
 
 
 def test_episodes_end_at_a_low_base_in_training_alone() -> None:

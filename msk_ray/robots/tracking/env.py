@@ -204,7 +204,12 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
 
     def reference(self, state: StepState) -> Reference:
         """What tracked bodies are to do in the state that a step has led to."""
-        found: Reference = self.measurements.once("reference", state, lambda: self.references.bodies(self.frame()))
+
+        def bodies() -> Reference:
+            # In float64 where `diagnose` takes differences in it.
+            return Reference(*(part.to(state.qpos.dtype) for part in self.references.bodies(self.frame())))
+
+        found: Reference = self.measurements.once("reference", state, bodies)
         return found
 
     def deviation(self, state: StepState) -> Deviation:
@@ -280,7 +285,8 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
 
         def shown(ahead: int) -> tuple[Tensor, ...]:
             frame = self.frame(ahead)
-            position, orientation = _place(*own, *self.references.anchor(frame).split((3, 4), dim=-1))
+            theirs = self.references.anchor(frame).to(state.qpos.dtype)
+            position, orientation = _place(*own, *theirs.split((3, 4), dim=-1))
             joints = self.references.joints(frame)
             return (joints, position, orientation) if full else (joints, orientation)
 
