@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from msk_ray.config import parse_config
+from msk_ray.diagnose.__main__ import main as diagnose
 from msk_ray.errors import ConfigError, DeviceError
 from msk_ray.robots.tracking import clip_scores, list_motions, track
 from msk_ray.robots.tracking.clip_scores import ClipScore, follow_clips, totals
@@ -104,3 +105,13 @@ def test_the_command_writes_a_row_for_each_clip(
     written = json.loads((tmp_path / "clips.json").read_text())
     assert (written["layout"], written["epoch"]) == ("no_state_estimation", 3)
     assert written["clips"][0]["normalised_return"] == 0.3
+
+
+def test_gradients_along_a_motion_are_those_of_float64_differences(tmp_path: Path, root: Path) -> None:
+    few = ["--states", "reset", "--horizons", "1", "3", "--worlds", "2", "--directions", "3"]
+    assert diagnose([str(root / "configs" / "g1_tracking.yaml"), *few, "--output", str(tmp_path)]) == 0
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert len(rows) == 4
+    for row in rows:
+        assert row["cosine"] > 0.9999
+        assert row["norm_ratio"] == pytest.approx(1.0, abs=1e-3)
