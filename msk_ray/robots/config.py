@@ -78,9 +78,9 @@ class VelocitySettings(ServoSettings):
     episode_length: Count = 1000
     reset_noise: NonNegative = 0.0
     reset_velocity_noise: NonNegative = 0.0
-    fall_height: Fraction = 0.0
-    """In training, episodes also end when the base is lower than this share of its default height; 0: they do not. A
-    robot that has sunk into a crouch seldom finds a way out of it. Not in scores."""
+    termination_height: NonNegative = 0.0
+    """In training, episodes also end when the base is lower than this [m]; 0: they do not. A robot that has sunk into a
+    crouch seldom finds a way out of it. Not in scores."""
     command_schedule: CommandSchedule | None = None
     """Factor on the ranges of the commanded velocity and yaw rate in training; null: 1."""
     cost_schedule: CostSchedule | None = None

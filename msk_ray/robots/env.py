@@ -127,15 +127,15 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     @classmethod
     def reference_settings(cls, config: AnyVelocitySettings) -> AnyVelocitySettings:
-        return super().reference_settings(config).model_copy(update={"fall_height": 0.0})
+        return super().reference_settings(config).model_copy(update={"termination_height": 0.0})
 
     def fell(self, state: StepState) -> Tensor:
         fallen = self.frames(state).axis(self.robot.base, 2)[:, 2] < math.cos(_FALLEN)
-        return fallen | self.is_low(state) if self.config.fall_height > 0.0 else fallen
+        return fallen | self.is_low(state) if self.config.termination_height > 0.0 else fallen
 
     def is_low(self, state: StepState) -> Tensor:
-        """Whether the base is lower than `env.fall_height` allows, (W,) bool."""
-        return self.base_height(state) < self.config.fall_height * self.default_height
+        """Whether the base is lower than `env.termination_height`, (W,) bool."""
+        return self.base_height(state) < self.config.termination_height
 
     def base_height(self, state: StepState) -> Tensor:
         """Height of the base above the ground [m], (W,)."""

@@ -72,7 +72,7 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
 
     def fell(self, state: StepState) -> Tensor:
         hit = self.hits(state, self.thighs) > 0
-        return hit | self.is_low(state) if self.config.fall_height > 0.0 else hit
+        return hit | self.is_low(state) if self.config.termination_height > 0.0 else hit
 
     def base_height(self, state: StepState) -> Tensor:
         return self.ground.below(state.qpos[:, None, :3], _REACH)[:, 0]

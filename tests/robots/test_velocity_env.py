@@ -292,19 +292,19 @@ def test_sensors_are_needed_by_those_that_observe_them() -> None:
 
 
 def test_episodes_end_at_a_low_base_in_training_alone() -> None:
-    env = make(3, "g1", fall_height=0.75)
+    env = make(3, "g1", termination_height=0.57)
     state = env.state.physics
     qpos = state.qpos.clone()
-    qpos[:, 2] = torch.tensor([0.58, 0.56, 0.76])  # of 0.76 m by default: 0.57 m is 0.75
+    qpos[:, 2] = torch.tensor([0.58, 0.56, 0.76])
     assert env.fell(state._replace(qpos=qpos)).tolist() == [False, True, False]
     height = base_height(env, state._replace(qpos=qpos), torch.zeros(3, 29), torch.zeros(3, 1))
     assert height.tolist() == pytest.approx([math.exp(-3.24), math.exp(-4.0), 1.0], abs=1e-5)
-    assert type(env).reference_settings(env.config).fall_height == 0.0
+    assert type(env).reference_settings(env.config).termination_height == 0.0
 
 
 def test_height_on_rough_ground_is_that_above_it() -> None:
-    env = make(4, "go1", fall_height=0.5)
-    rough = make_rough(4, fall_height=0.5)
+    env = make(4, "go1")
+    rough = make_rough(4, termination_height=0.14)
     state = rough.state.physics
     height = rough.base_height(state)
     assert (height - (env.model.key_qpos[0, 2] + 0.03)).abs().max() < 0.15
