@@ -74,12 +74,12 @@ def test_what_is_no_motion_is_refused_in_one_line(tmp_path: Path, model: mujoco.
 def test_files_that_are_too_large_are_not_read(
     tmp_path: Path, model: mujoco.MjModel, squat: Motion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(motions, "_MOST_BYTES", 2**20)
+    monkeypatch.setattr(motions, "_MAX_BYTES", 2**20)
     write_csv(tmp_path / "long.csv", replace(squat, joints=np.repeat(squat.joints, 1, axis=0)))
     np.savez_compressed(tmp_path / "bomb.npz", fps=np.array([50.0]), joint_pos=np.zeros((2**16, 29)))
     with pytest.raises(ConfigError, match="its content is larger than 1 MiB"):
         read_motion(tmp_path / "bomb.npz", model)
-    monkeypatch.setattr(motions, "_MOST_BYTES", 1000)
+    monkeypatch.setattr(motions, "_MAX_BYTES", 1000)
     with pytest.raises(ConfigError, match="larger than 0 MiB"):
         read_motion(tmp_path / "long.csv", model)
 
