@@ -37,7 +37,7 @@ Evaluate a policy: without noise, from fixed initial states, under the environme
 Prints score, speed, falls, episode length and every reward term with its spread over episodes, and stores them in the
 trial's eval.json (for the policies in policies/ it only prints). For an experiment it evaluates the best policy of each
 trial, ranks the trials, and writes the ranking to the experiment's eval.json. Without options it repeats the evaluation
-that gave eval/score, by which trials are ranked: on the same device, every digit is the same. For policies/, or another
+that gave eval/score, by which trials are ranked; on the same device, every digit is the same. For policies/, or another
 folder that export --zoo wrote, it repeats the recorded evaluation of each policy and prints the table of its README."""
 
 EXAMPLES = """\
@@ -68,15 +68,15 @@ def parser() -> Parser:
         "--physics",
         metavar="LIST",
         help="comma-separated: reference (used for scores), own (used in training), or names from the environment "
-        "(default: reference, which is own where the environment names no physics)",
+        "(default: reference; if the environment names no physics, that is the same as own)",
     )
     p.add_argument("--vary", metavar="FIELD=LIST", help=HELP)
     p.add_argument(
         "--with",
         dest="conditions",
         metavar="LIST",
-        help="comma-separated harder conditions, evaluated in addition to the usual one: disturbed (by the trial's own "
-        "physics.randomize), push and weak for legs, and uphill, downhill and rough on myoleg26",
+        help="comma-separated harder conditions, evaluated after the usual one: disturbed (by the trial's own "
+        "physics.randomize); for legs also push and weak; for myoleg26 also uphill, downhill and rough",
     )
     p.add_argument(
         "--in",
@@ -106,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     variations = parse_vary(args.vary) if args.vary is not None else []
     python = _foreign_python(args)
     if args.vary is not None and args.conditions is not None:
-        raise ConfigError("--with: it is for the model's own values; leave --vary out")
+        raise ConfigError("--with: conditions need the unchanged model; leave --vary out")
     if target.kind is Kind.ZOO:
         return _evaluate_zoo(target, args)
     if target.kind is not Kind.EXPERIMENT:
@@ -188,7 +188,7 @@ def _foreign_python(args: argparse.Namespace) -> Path | None:
     for option in ("physics", "vary", "device", "conditions"):
         if getattr(args, option) is not None:
             flag = {"conditions": "with"}.get(option, option)
-            raise ConfigError(f"--{flag}: --in {args.elsewhere} has its own physics, on the CPU; leave it out")
+            raise ConfigError(f"--{flag}: --in {args.elsewhere} has its own physics and device; leave it out")
     return find_python(foreign_scoring(args.elsewhere), args.python)
 
 

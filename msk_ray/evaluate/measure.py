@@ -149,8 +149,8 @@ class Bench:
         evaluator, physics = self.evaluator(config, conditioned)
         if request.condition is not None:
             physics = f"{physics.partition(',')[0]}, {request.condition}"
-        own = policy.config.evaluation
-        seeds = request.seeds or (own.seed,)
+        trial_evaluation = policy.config.evaluation
+        seeds = request.seeds or (trial_evaluation.seed,)
         with named_out_of_memory(self._device, evaluator.env.nworld, *_WORLDS):
             runs = [
                 evaluator.episodes(policy.on(evaluator.env), seed, pace=self.pace(evaluator.steps)) for seed in seeds
@@ -159,9 +159,9 @@ class Bench:
         canonical = (
             request.varied is None
             and request.condition is None
-            and evaluator.env.nworld == own.nworld
-            and seeds == (own.seed,)
-            and request.steps in (None, own.steps or policy.config.env.episode_length)
+            and evaluator.env.nworld == trial_evaluation.nworld
+            and seeds == (trial_evaluation.seed,)
+            and request.steps in (None, trial_evaluation.steps or policy.config.env.episode_length)
             and named_physics(policy.config, request.physics)[1] == reference
         )
         setup = EvaluationSetup(
