@@ -30,9 +30,9 @@ DESCRIPTION = """\
 List the tasks that can be trained: their names, what is learned, the configs in configs/ that train them, and the score
 of the best policy in policies/.
 
-A task is an environment: of this package, of an installed one, or a class of yours that a file in configs/ of the
-current folder names. Scores of a task are taken under its reference physics; --json also has policies that were scored
-under another."""
+A task is an environment of this package or of another installed one, or a class of yours that a file in configs/ of the
+current folder names. Scores are taken under the task's reference physics; --json also lists policies with scores under
+other physics."""
 
 EXAMPLES = """\
   msk-ray list
@@ -43,14 +43,14 @@ EXAMPLES = """\
 
 @dataclass(frozen=True)
 class Task:
-    """A task and what there is for it."""
+    """A task with its configs and policies."""
 
     name: str
     """What `env.name` takes."""
     description: str
     """What is learned, in one sentence; empty if nothing says so."""
     configs: tuple[str, ...]
-    """Names in `configs/`, that of the task first."""
+    """Names in `configs/`; the one named after the task comes first."""
     policies: Mapping[str, Score]
     """Scores of its policies in `policies/`, by name."""
     physics: str

@@ -8,12 +8,12 @@ from msk_ray.config.sections import Count, Fraction, Section, Whole
 
 
 def ramp(start: float, end: float, epoch: float, last: int, first: int = 0) -> float:
-    """`start` until the epoch `first`, `end` from the epoch `last` on, linear between."""
+    """A value that is `start` until the epoch `first`, `end` from the epoch `last` on, and linear in between."""
     return start + (end - start) * min(1.0, max(0.0, (epoch - first) / (last - first)))
 
 
 class Rise(Section):
-    """A factor: `start` until the epoch `begin`, 1 from the epoch `end` on, linear between."""
+    """A factor that is `start` until the epoch `begin`, 1 from the epoch `end` on, and linear in between."""
 
     start: Fraction
     begin: Whole
@@ -33,16 +33,16 @@ class Rise(Section):
 class CostSchedule(Rise):
     """Factor on the weights of costs in training.
 
-    A robot that pays the full price for every change of its action from the start learns to stand still, before it has
-    learned to walk; one that pays nothing learns to tremble.
+    A robot that pays in full for every change of its action from the start learns to stand still before it learns to
+    walk; one that pays nothing learns to tremble.
     """
 
 
 class CommandSchedule(Rise):
-    """Factor on the ranges of commands in training. A humanoid that is asked to run at once learns to stand."""
+    """Factor on the ranges of commands in training. A humanoid that is asked to run from the start learns to stand."""
 
 
 def cost_share(settings: Any, epoch: int) -> float:
-    """`Term.schedule` of a cost whose environment has a setting `cost_schedule: CostSchedule | None`."""
+    """`Term.schedule` of a cost, for an environment that has a setting `cost_schedule: CostSchedule | None`."""
     schedule: CostSchedule | None = settings.cost_schedule
     return 1.0 if schedule is None else schedule.at(epoch)

@@ -372,7 +372,7 @@ class Env(Task[SettingsT]):
     @property
     def asymmetric(self) -> bool:
         """Whether the critic sees something other than the policy."""
-        return self.overrides("observe_critic") or self.disturbances.of_observations
+        return self.overrides("observe_critic") or self.disturbances.disturbs_observations
 
     def critic_observation(self) -> Tensor:
         """What the critic sees of the current state, (W, C)."""

@@ -1,4 +1,4 @@
-"""Commands as functions of the numbers drawn when an episode begins, and of its age: a step draws nothing.
+"""Commands, computed from numbers drawn when an episode begins and from its age: a step draws nothing.
 
 Axes: N episodes, W worlds, C numbers of a command.
 """
@@ -14,12 +14,12 @@ from msk_ray.config.commands import Commands
 
 
 class Draws(NamedTuple):
-    """The draws of one command for an episode."""
+    """Where the random numbers of one command are, and when the command changes."""
 
     columns: slice
-    """Their place among those of all commands."""
+    """Columns of its numbers among the numbers of all commands."""
     times: int
-    """How often it can be drawn in an episode."""
+    """Largest number of times that it is drawn in an episode."""
     every: tuple[float, float] | None
     """Shortest and longest time from one draw to the next [s]."""
 
@@ -27,8 +27,8 @@ class Draws(NamedTuple):
         """The command (W, C).
 
         Args:
-            drawn: the draws of all commands, uniform in [0, 1), one row for each world.
-            time: since the episode began [s], (W,).
+            drawn: numbers of all commands, uniform in [0, 1), one row for each world.
+            time: time since the episode began [s], (W,).
             ranges: smallest and largest values, (2, C).
         """
         draws = drawn[:, self.columns].unflatten(-1, (self.times, -1))
@@ -52,13 +52,13 @@ class DrawnCommands(NamedTuple):
 
     draws: Mapping[str, Draws]
     size: int
-    """How many numbers the draws of all take for an episode."""
+    """Count of the random numbers of an episode, for all commands together."""
     ranges: Mapping[str, Tensor]
     """Smallest and largest values of each command, (2, C); they may be changed in place."""
 
     @classmethod
     def of(cls, commands: Commands, seconds: float, device: torch.device) -> Self:
-        """Those of a section, for episodes of so many seconds."""
+        """The commands of a section, for episodes of at most `seconds` [s]."""
         draws, ranges, size = {}, {}, 0
         for command in commands.declared:
             section = getattr(commands, command.name)
@@ -71,5 +71,5 @@ class DrawnCommands(NamedTuple):
         return cls(draws, size, ranges)
 
     def value(self, name: str, drawn: Tensor, time: Tensor) -> Tensor:
-        """A command (W, C); `drawn` and `time` as for `Draws.value`."""
+        """The command of this name, (W, C); `drawn` and `time` as for `Draws.value`."""
         return self.draws[name].value(drawn, time, self.ranges[name])

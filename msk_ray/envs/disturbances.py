@@ -1,10 +1,11 @@
-"""What disturbs a policy in training beside parameters of the model: errors and delays of observations, late controls,
-kicks.
+"""Disturbances in training besides random parameters of the model: errors and delays of observations, delays of
+controls, and kicks.
 
-All of it is a function of numbers that are drawn when an episode begins, of the episode's age, and of memories: a step
-draws nothing, so that it gives the same observation as often as it is asked.
+All of them are functions of numbers drawn when an episode begins, of the episode's age, and of memories. A step draws
+nothing, so the same state always gives the same observation.
 
-Axes: W worlds, O observation, M its entries that memories do not give, D numbers drawn for an episode.
+Axes: W worlds, O observation, M measured entries of the observation (all but remembered ones), D numbers drawn for an
+episode.
 """
 
 import math
@@ -30,8 +31,9 @@ if TYPE_CHECKING:
     from msk_ray.envs.base import Env
 
 _STREAM = 2
+"""Number of the random stream, for `seed_stream`."""
 _OBSERVATIONS, _CONTROLS, _STEPS = "earlier observations", "earlier controls", "earlier steps"
-"""Memories: observations and controls of earlier env steps, the newest first, and how many steps are in there."""
+"""Names of memories: observations and controls of earlier env steps, newest first, and the number of these steps."""
 _LOW_HALF = 0xFFFFFFFF
 
 
@@ -41,17 +43,18 @@ class Disturbances:
     Args:
         config: the section; None: nothing is disturbed.
         env: the environment, prepared.
-        first: place of the first of its numbers in `EnvState.numbers`.
-        seed: the environment's; the generator is another one, so that initial states, commands and parameters of the
-            model are those of a trial without disturbances.
+        first: column of `EnvState.numbers` in which its numbers begin.
+        seed: seed of the environment. The numbers come from a generator of their own, so that initial states, commands
+            and parameters of the model are the same as without disturbances.
 
     Attributes:
         generator: source of the numbers of episodes.
-        size: D.
-        of_observations: whether the policy sees something other than what `observe` gives.
+        size: count D of the numbers of an episode.
+        disturbs_observations: whether the policy may be given something other than what `observe` returns.
 
     Raises:
-        ConfigError: the environment has no such entries or joints, or does not name its entries.
+        ConfigError: the observation has no entries, or the model no joints, of the names in the section; or the
+            environment does not name its entries; or controls are late by more substeps than an env step has.
     """
 
     def __init__(self, config: RandomizeConfig | None, env: "Env[Any]", first: int, seed: int) -> None:
@@ -61,8 +64,8 @@ class Disturbances:
         self.seed(seed)
         layout = _layout(config, env)
         self._layout_size = len(layout)
-        measured = [place for place, entry in enumerate(layout) if not entry.remembered]
-        names = [layout[place].name for place in measured]
+        measured = [column for column, entry in enumerate(layout) if not entry.remembered]
+        names = [layout[column].name for column in measured]
         self._measured = None if len(measured) == len(layout) else torch.tensor(measured, device=env.device)
         self._noise = EntryErrors("observation_noise", config.observation_noise, names, env.device)
         self._bias = EntryErrors("observation_bias", config.observation_bias, names, env.device)
@@ -86,11 +89,11 @@ class Disturbances:
         }
         self.size = sum(widths.values())
         self._measured_count = len(names)
-        self.of_observations = bool(names)
+        self.disturbs_observations = bool(names)
         self._widths = widths
 
     def seed(self, seed: int) -> None:
-        """Draw from now on as after construction with this seed, the environment's."""
+        """Restart the generator as if constructed with this seed."""
         seed_stream(self.generator, seed, _STREAM)
 
     def draw(self, count: int) -> Tensor:
@@ -98,16 +101,16 @@ class Disturbances:
         return torch.rand((count, self.size), generator=self.generator, device=self._env.device)
 
     def memories(self) -> dict[str, Memory]:
-        """Memories of its own, with the gradients that late observations and controls have."""
-        late = {
+        """The memories that delays need; gradients flow through late observations and controls."""
+        sizes = {
             _OBSERVATIONS: _most(self._observation_delay) * self._measured_count,
             _CONTROLS: (_most(self._control_delay) + (self._substep_delay is not None)) * self._env.model.nu,
         }
-        kept = {name: Memory(size, gradient=True) for name, size in late.items() if size}
-        return {**kept, _STEPS: Memory(1)} if kept else {}
+        delayed = {name: Memory(size, gradient=True) for name, size in sizes.items() if size}
+        return {**delayed, _STEPS: Memory(1)} if delayed else {}
 
     def remember(self, before: EnvState, action: Tensor) -> dict[str, Tensor]:
-        """Its memories after a step by `action` from `before`, the current state of the environment."""
+        """The values of `memories` after a step by `action` from `before`, the current state of the environment."""
         env, memory = self._env, before.memory
         newest: dict[str, Tensor] = {}
         if _OBSERVATIONS in memory:
@@ -116,32 +119,40 @@ class Disturbances:
             newest[_CONTROLS] = env.control(action)
         if not newest:
             return {}
-        kept = {name: torch.cat((new, memory[name][:, : -new.shape[1]]), dim=-1) for name, new in newest.items()}
-        return {**kept, _STEPS: memory[_STEPS] + 1.0}
+        delayed = {name: torch.cat((new, memory[name][:, : -new.shape[1]]), dim=-1) for name, new in newest.items()}
+        return {**delayed, _STEPS: memory[_STEPS] + 1.0}
 
     def pushed(self, physics: StepState, state: EnvState) -> StepState:
-        """`physics` as the step from `state` begins with it, after a kick if it is time for one."""
+        """`physics` as the step from `state` begins with it: after a kick where it is time for one."""
         if self._kicks is None:
             return physics
         return self._kicks.applied(physics, state.age, self._numbers(state, "push"))
 
     def control(self, control: Tensor, state: EnvState) -> Tensor:
-        """The controls (W, nu) that reach the actuators in the step from `state`, when these are sent; those of each
-        substep, (S, W, nu), if controls may be late by some substeps."""
+        """The controls that reach the actuators in the step from `state` when `control` (W, nu) is sent.
+
+        Returns:
+            (W, nu), or (S, W, nu) for each of S substeps if controls may be late by substeps.
+        """
         if self._substep_delay is None:
             return self._arrived(control, state)
         late = self._drawn(self._substep_delay, state, "control_delay_substeps")
         return torch.stack([self._arrived(control, state, late > k) for k in range(self._env.sim.substeps)])
 
     def _arrived(self, control: Tensor, state: EnvState, on_its_way: Tensor | None = None) -> Tensor:
-        """The controls (W, nu) that have reached the actuators: in worlds where the newest is still `on_its_way`, bool
-        (W,), those of one env step before."""
+        """Controls (W, nu) that have reached the actuators.
+
+        Args:
+            control: the newest controls, (W, nu).
+            state: state in which they were sent.
+            on_its_way: worlds in which they are one env step later than `control_delay` says, (W,) bool; None: none.
+        """
         if self._control_delay is not None or on_its_way is not None:
             late = self._drawn(self._control_delay, state, "control_delay")
             late = late if on_its_way is None else late + on_its_way
             control = _of_earlier(control, state.memory.get(_CONTROLS), self._possible(late, state))
         if self._encoders.size:
-            control = self._encoders.followed(control, self._numbers(state, "encoders"))
+            control = self._encoders.shifted(control, self._numbers(state, "encoders"))
         return control
 
     def observation(self, obs: Tensor, state: EnvState) -> Tensor:
@@ -156,7 +167,7 @@ class Disturbances:
         return obs.index_copy(1, self._measured, self._disturbed(self._measured_of(obs), state))
 
     def _measured_of(self, obs: Tensor) -> Tensor:
-        """Those entries (W, M) of observations (W, O) that memories do not give."""
+        """The measured entries (W, M) of observations (W, O)."""
         return obs if self._measured is None else obs.index_select(1, self._measured)
 
     def _disturbed(self, obs: Tensor, state: EnvState) -> Tensor:
@@ -171,34 +182,34 @@ class Disturbances:
         if self._encoders.size:
             obs = self._encoders.added(obs, self._numbers(state, "encoders"))
         if self._noise.size:
-            # The noise of the step in which it was observed.
+            # A late observation keeps the noise of the step in which it was made.
             obs = self._noise.added(obs, uniform_hash(self._numbers(state, "noise")[:, 0], age, self._noise.size))
         return obs
 
     def _drawn(self, delay: tuple[int, int] | None, state: EnvState, name: str) -> Tensor:
-        """The delay of each world's episode, (W,) int64."""
+        """The delay of each world's episode in the units of the setting, (W,) int64."""
         if delay is None or not delay[1]:
             return torch.zeros_like(state.age)
         fewest, most = delay
         return fewest + (self._numbers(state, name)[:, 0] * (most - fewest + 1)).long()
 
     def _possible(self, late: Tensor, state: EnvState) -> Tensor:
-        """Env steps by which something is late, (W,) int64, at most those of the episode that have been."""
-        been = state.memory.get(_STEPS)
-        return late if been is None else torch.minimum(late, been[:, 0].long())
+        """Delays [env steps], (W,) int64, limited to the age of the memory: nothing is older than its episode."""
+        remembered_steps = state.memory.get(_STEPS)
+        return late if remembered_steps is None else torch.minimum(late, remembered_steps[:, 0].long())
 
     def _numbers(self, state: EnvState, name: str) -> Tensor:
-        """The numbers (W, n) for one of the settings."""
-        every = state.numbers[:, self._first : self._first + self.size]
-        return every.split(list(self._widths.values()), dim=-1)[list(self._widths).index(name)]
+        """The numbers (W, n) drawn for the disturbance of this name."""
+        drawn = state.numbers[:, self._first : self._first + self.size]
+        return drawn.split(list(self._widths.values()), dim=-1)[list(self._widths).index(name)]
 
 
 class _Kicks:
-    """Kicks, drawn as a command that changes is."""
+    """Kicks: when each comes and how large it is are drawn like a command that changes within an episode."""
 
     def __init__(self, push: Push, env: "Env[Any]") -> None:
         self._step_s = env.config.control_timestep
-        dofs = dict(_kicked(push, env.model))
+        dofs = dict(_kicked_dofs(push, env.model))
         times = math.ceil(env.config.episode_length * self._step_s / push.every[0])
         self.size = times * (len(dofs) + 1)
         self._draws = Draws(slice(0, self.size), times, push.every)
@@ -207,7 +218,7 @@ class _Kicks:
         self._ranges = torch.stack((-largest, largest))
 
     def applied(self, state: StepState, age: Tensor, drawn: Tensor) -> StepState:
-        """The state after the kick, if any, of an age (W,), from the numbers (W, size)."""
+        """The state at an age [env steps], (W,), after its kick, if any, from the drawn numbers (W, size)."""
         before, now = ((steps * self._step_s) for steps in (age - 1, age))
         begins = self._draws.times_drawn(drawn, now) > self._draws.times_drawn(drawn, before)
         kick = self._draws.value(drawn, now, self._ranges) * begins[:, None]
@@ -215,9 +226,14 @@ class _Kicks:
 
 
 def uniform_hash(seed: Tensor, step: Tensor, count: int) -> Tensor:
-    """Uniform numbers in [0, 1), (W, count), another row for each step (W,) int64 of each seed (W,) in [0, 1).
+    """Uniform numbers in [0, 1), (W, count): hashes of a seed, a step and the column.
 
-    They are hashes of seed, step and column by the function `lowbias32` of https://github.com/skeeto/hash-prospector.
+    The hash function is `lowbias32` of https://github.com/skeeto/hash-prospector.
+
+    Args:
+        seed: in [0, 1), (W,).
+        step: (W,) int64.
+        count: number of columns.
     """
     columns = torch.arange(count, device=seed.device)
     row = _hash(_hash((seed * 2.0**UNIFORM_BITS).long()) + step)
@@ -233,11 +249,18 @@ def _hash(values: Tensor) -> Tensor:
 
 
 def _most(delay: tuple[int, int] | None) -> int:
+    """The longest delay of a setting."""
     return 0 if delay is None else delay[1]
 
 
 def _of_earlier(current: Tensor, earlier: Tensor | None, late: Tensor) -> Tensor:
-    """In each world the values (W, n) of `late` (W,) env steps ago, of the current ones and earlier ones (W, k n)."""
+    """The values (W, n) of `late` env steps ago in each world.
+
+    Args:
+        current: the current values, (W, n).
+        earlier: the values of k earlier steps, newest first, (W, k n); None: there are none.
+        late: delays from 0 to k [env steps], (W,).
+    """
     if earlier is None:
         return current
     chosen = current
@@ -247,7 +270,11 @@ def _of_earlier(current: Tensor, earlier: Tensor | None, late: Tensor) -> Tensor
 
 
 def _layout(config: RandomizeConfig, env: "Env[Any]") -> list[Entry]:
-    """All entries of the observation, if a setting needs them."""
+    """All entries of the observation; none if no setting needs their names.
+
+    Raises:
+        ConfigError: a setting needs them, and the environment does not name them.
+    """
     observed = ("observation_noise", "observation_bias", "encoder_bias", "observation_delay")
     needing = [name for name in observed if getattr(config, name) is not None]
     if not needing:
@@ -261,8 +288,12 @@ def _layout(config: RandomizeConfig, env: "Env[Any]") -> list[Entry]:
     return layout
 
 
-def _kicked(push: Push, model: mujoco.MjModel) -> Iterator[tuple[int, float]]:
-    """Degrees of freedom, and the largest changes of their velocities."""
+def _kicked_dofs(push: Push, model: mujoco.MjModel) -> Iterator[tuple[int, float]]:
+    """Numbers of the degrees of freedom that are kicked, and the largest change of the velocity of each.
+
+    Raises:
+        ConfigError: the model has no such joint, or the joint has another number of velocities.
+    """
     key, joints = "physics.randomize.push.velocity", [model.joint(i).name or str(i) for i in range(model.njnt)]
     for name, largest in push.velocity.items():
         if name not in joints:

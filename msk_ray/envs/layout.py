@@ -1,4 +1,4 @@
-"""What the numbers of an observation mean."""
+"""Names and units of the numbers of an observation."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -9,26 +9,26 @@ class Entry(NamedTuple):
 
     name: str
     unit: str
-    """Unit of the number as it stands there; empty if it has none."""
+    """Unit of the number as observed, after any scaling; empty if it has none."""
     remembered: bool = False
-    """Whether it is shown as a memory has it: errors and delays of observations leave it as it is."""
+    """Whether the number comes from a memory; errors and delays of observations then do not change it."""
 
 
 def entries(names: Iterable[str], unit: str = "") -> list[Entry]:
-    """Entries of one unit."""
+    """Entries that have the same unit."""
     return [Entry(name, unit) for name in names]
 
 
-def remembered(shown: Iterable[Entry]) -> list[Entry]:
-    """The same entries as memories have them, such as frames of a history."""
-    return [entry._replace(remembered=True) for entry in shown]
+def remembered(layout: Iterable[Entry]) -> list[Entry]:
+    """The same entries, marked as coming from a memory, such as the frames of a history."""
+    return [entry._replace(remembered=True) for entry in layout]
 
 
 def each(names: Iterable[str], what: str, unit: str = "") -> list[Entry]:
-    """One entry for each of several things, NAME_WHAT."""
+    """One entry for each name, called NAME_WHAT."""
     return entries((f"{name}_{what}" for name in names), unit)
 
 
 def vector(name: str, unit: str = "") -> list[Entry]:
-    """The three entries of a vector in world coordinates."""
+    """The entries NAME_x, NAME_y and NAME_z of a vector."""
     return entries((f"{name}_x", f"{name}_y", f"{name}_z"), unit)

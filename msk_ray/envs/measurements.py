@@ -1,4 +1,4 @@
-"""What is measured in a state: frames, tendons, sensors, contacts and the ground.
+"""Measures what a state holds: frames of bodies, tendons, sensors, contacts and the ground.
 
 Axes: W worlds.
 """
@@ -21,18 +21,18 @@ from msk_ray.step.forward.contact_watch import FIGURES
 
 
 class Measurements:
-    """Measures states of a simulation, each quantity once, until another state is asked for.
+    """Measures states of a simulation, and keeps each quantity until another state is measured.
 
-    Contact forces and the readings of some sensors belong to the step that led to a state. They are values without
-    gradient, and 0 in a world that diverged.
+    Contact forces and the readings of some sensors belong to the step that led to a state. They have no gradient, and
+    are 0 in a world that diverged.
 
     Args:
         sim: the simulation.
         owner: name of the environment's class, for messages.
-        kinematics, tendons, ground: instruments other than those of the simulation, such as exact ones in float64.
+        kinematics, tendons, ground: replacements for the simulation's own, such as exact ones in float64.
 
     Attributes:
-        ignore_contact_forces: whether all that belongs to a step reads as 0, for states that no step has led to and for
+        ignore_contact_forces: whether everything that belongs to a step reads 0, for states that no step led to and for
             comparisons of gradients.
     """
 
@@ -45,22 +45,22 @@ class Measurements:
         ground: Ground | None = None,
     ) -> None:
         self._sim, self._owner = sim, owner
-        self._instruments = kinematics, tendons, ground
+        self._replacements = kinematics, tendons, ground
         self._step: tuple[StepState, Tensor] | None = None
         self._measured: dict[Hashable, tuple[StepState, bool, Any]] = {}
         self.ignore_contact_forces = False
 
     def begin(self, reached: StepState, diverged: Tensor) -> None:
-        """A step has led to `reached`; (W,) bool: in which worlds it diverged."""
+        """Note that a step led to the state `reached`, and in which worlds it `diverged`, (W,) bool."""
         self._step = reached, diverged
 
     def forget(self) -> None:
-        """Keep no state, and so no graph, in memory."""
+        """Drop all kept states, and with them their graphs."""
         self._step = None
         self._measured = {}
 
     def once(self, what: Hashable, state: StepState, measure: Callable[[], Any]) -> Any:
-        """The result of `measure` for `state`, kept under the name `what` until another state is asked for."""
+        """The result of `measure` for `state`, kept under the key `what` until another state is measured."""
         grad = torch.is_grad_enabled()
         kept = self._measured.get(what)
         if kept is None or kept[0] is not state or kept[1] != grad:
@@ -110,15 +110,15 @@ class Measurements:
     @cached_property
     def ground(self) -> Ground:
         """As `Env.ground`."""
-        return self._instruments[2] or Ground(self._sim.batch)
+        return self._replacements[2] or Ground(self._sim.batch)
 
     @cached_property
     def _kinematics(self) -> Kinematics:
-        return self._instruments[0] or Kinematics(self._sim.batch)
+        return self._replacements[0] or Kinematics(self._sim.batch)
 
     @cached_property
     def _tendons(self) -> Tendons:
-        return self._instruments[1] or Tendons(self._sim.batch)
+        return self._replacements[1] or Tendons(self._sim.batch)
 
     @cached_property
     def _contact_queries(self) -> ContactQueries:
@@ -136,7 +136,11 @@ class Measurements:
         return self._sim.sensordata().masked_fill(diverged[:, None], 0.0)
 
     def _diverged_in_step_to(self, state: StepState, what: str) -> Tensor:
-        """The worlds (W,) bool that diverged in the step that led to `state`."""
+        """The worlds that diverged in the step that led to `state`, (W,) bool.
+
+        Raises:
+            ConfigError: no step led to this state; the message says where `what` can be used.
+        """
         if self._step is None or self._step[0] is not state:
             raise ConfigError(
                 f"{self._owner}: {what} belong to a step, not to a state: use them in "

@@ -19,9 +19,9 @@ class Memory(NamedTuple):
     size: int
     """Numbers for each world."""
     gradient: bool = False
-    """Whether gradients flow through it from one env step to the one before; otherwise only within a step."""
+    """Whether gradients flow through it from env step to env step; otherwise they stay within a step."""
     start: float = 0.0
-    """Value at the start of an episode, unless `Env.begin_memory` gives another."""
+    """Value at the start of an episode, unless `Env.begin_memory` gives another one."""
 
 
 class Memories:
@@ -30,7 +30,7 @@ class Memories:
     Args:
         declared: their declarations by name.
         nworld: number of worlds W.
-        device: where they are.
+        device: where their values are.
 
     Attributes:
         start: declared values at the start of an episode, (W, size), by name.
@@ -51,22 +51,22 @@ class Memories:
         return {name: values[name] for name in self.start}
 
     def carried(self, state: EnvState) -> EnvState:
-        """A state as the next step begins with it: cut from the graph where no gradient is meant to cross steps."""
+        """A state as the next step begins with it: memories without gradient are detached from the graph."""
         memory = {
             name: values if name in self._with_gradient else values.detach() for name, values in state.memory.items()
         }
         return state._replace(memory=memory)
 
     def begun(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Values at the start of episodes, (W, size) by name: the declared ones, but for those given."""
+        """Values at the start of episodes, (W, size) by name: the given ones, and the declared ones for the rest."""
         return {name: values[name].detach() if name in values else start for name, start in self.start.items()}
 
 
 def restored(state: EnvState, saved: Mapping[str, Tensor]) -> EnvState:
-    """A state with saved values of its memories; those that were not saved stay as they are.
+    """A state with the saved values of its memories; memories that were not saved stay as they are.
 
     Raises:
-        CheckpointError: one was saved with another size.
+        CheckpointError: a memory was saved with another size.
     """
     for name, values in state.memory.items():
         if name in saved and saved[name].shape != values.shape:

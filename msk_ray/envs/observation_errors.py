@@ -1,4 +1,4 @@
-"""Errors of what a policy is told: of entries of the observation, and of encoders, which servos follow too.
+"""Errors in what a policy observes: in entries of the observation, and in encoders, which servos read too.
 
 Axes: W worlds, O observation, E entries or joints with an error.
 """
@@ -15,9 +15,9 @@ from msk_ray.config import Spread
 from msk_ray.errors import ConfigError, shortened
 
 UNIFORM_BITS = 24
-"""Bits of a uniform number in float32."""
+"""Bits of a uniform float32 number in [0, 1)."""
 _LISTED = 400
-"""Characters of names that an error lists."""
+"""Largest number of characters that an error spends on known names."""
 
 
 class EntryErrors:
@@ -25,15 +25,15 @@ class EntryErrors:
 
     Args:
         setting: name of the setting in `physics.randomize`.
-        spreads: its distributions, by name or pattern.
-        names: of all entries.
+        spreads: its distributions, by name or pattern of entries.
+        names: names of all entries.
         device: where observations are.
 
     Attributes:
-        size: E.
+        size: number of entries with an error, E.
 
     Raises:
-        ConfigError: there is no such entry, or two distributions are for one.
+        ConfigError: a pattern matches no entry, or an entry has two distributions.
     """
 
     def __init__(
@@ -52,21 +52,21 @@ class EntryErrors:
 class EncoderErrors:
     """Errors of the encoders of joints with position servos.
 
-    A policy that is shown q + b sends targets in the same, wrong, coordinates: the servo, which reads the same encoder,
-    brings the joint to the target − b.
+    An encoder with the error b reads q + b where the joint is at q. The policy observes q + b, and the servo, which
+    reads the same encoder, brings the joint to its target − b.
 
     Args:
-        spreads: distributions of b by name or pattern of joints [m, rad].
+        spreads: distributions of b [m, rad], by name or pattern of joints.
         model: the model.
-        names: of all entries of the observation; a joint's position is its entry NAME_angle or NAME_position.
+        names: names of all entries of the observation; a joint's position is the entry NAME_angle or NAME_position.
         device: where observations and controls are.
 
     Attributes:
-        size: E.
+        size: number of joints with an error, E.
 
     Raises:
-        ConfigError: no such joint has a position servo, two distributions are for one, or the observation does not show
-            its position.
+        ConfigError: a pattern matches no joint with a position servo, a joint has two distributions, or the observation
+            does not show its position.
     """
 
     def __init__(
@@ -78,32 +78,32 @@ class EncoderErrors:
         chosen = dict(sorted(_chosen("encoder_bias", spreads or {}, joint_names, "joint with a position servo")))
         self.size = len(chosen)
         self._draws = _Draws(list(chosen.values()), device)
-        self._shown, self._shift = torch.zeros(self.size, len(names)), torch.zeros(self.size, model.nu)
-        for place, which in enumerate(chosen):
-            shown = [f"{joint_names[which]}_{kind}" for kind in ("angle", "position")]
-            entries = [entry for entry, name in enumerate(names) if name in shown]
+        to_entries, to_controls = torch.zeros(self.size, len(names)), torch.zeros(self.size, model.nu)
+        for row, which in enumerate(chosen):
+            entry_names = [f"{joint_names[which]}_{kind}" for kind in ("angle", "position")]
+            entries = [entry for entry, name in enumerate(names) if name in entry_names]
             if not entries:
                 raise ConfigError(
                     f"physics.randomize.encoder_bias: the observation does not show joint {joint_names[which]!r} as "
-                    f"{' or '.join(shown)}: name the entry so in observation_layout, or leave the joint out"
+                    f"{' or '.join(entry_names)}: name the entry so in observation_layout, or leave the joint out"
                 )
-            self._shown[place, entries] = 1.0
+            to_entries[row, entries] = 1.0
             for servo, joint in servos.items():
                 if joint == joints[which]:
-                    self._shift[place, servo] = -float(model.actuator_gear[servo, 0])
-        self._shown, self._shift = self._shown.to(device), self._shift.to(device)
+                    to_controls[row, servo] = -float(model.actuator_gear[servo, 0])
+        self._to_entries, self._to_controls = to_entries.to(device), to_controls.to(device)
 
     def added(self, obs: Tensor, uniform: Tensor) -> Tensor:
-        """Observations (W, O) with the errors made from uniform numbers in [0, 1), (W, E)."""
-        return torch.addmm(obs, self._draws.of(uniform), self._shown)
+        """Observations (W, O) with errors made from uniform numbers in [0, 1), (W, E)."""
+        return torch.addmm(obs, self._draws.of(uniform), self._to_entries)
 
-    def followed(self, control: Tensor, uniform: Tensor) -> Tensor:
-        """Controls (W, nu) that bring the joints to where servos with these errors do."""
-        return torch.addmm(control, self._draws.of(uniform), self._shift)
+    def shifted(self, control: Tensor, uniform: Tensor) -> Tensor:
+        """Controls (W, nu) that bring exact servos to where the errors would bring these, from the same numbers."""
+        return torch.addmm(control, self._draws.of(uniform), self._to_controls)
 
 
 class _Draws:
-    """Numbers about 0, each with a distribution of its own."""
+    """E random numbers with mean 0, each with a distribution of its own."""
 
     def __init__(self, spreads: Sequence[Spread], device: torch.device) -> None:
         self._sizes = torch.tensor([spread.uniform or spread.normal or 0.0 for spread in spreads], device=device)
@@ -111,7 +111,7 @@ class _Draws:
         self._normal = torch.tensor(normal, device=device) if any(normal) else None
 
     def of(self, uniform: Tensor) -> Tensor:
-        """From uniform numbers in [0, 1), both (W, E)."""
+        """The random numbers made from uniform numbers in [0, 1), both (W, E)."""
         share = 2.0 * uniform - 1.0
         if self._normal is not None:
             inside = share.clamp(-1.0 + 2.0**-UNIFORM_BITS, 1.0 - 2.0**-UNIFORM_BITS)
@@ -120,10 +120,10 @@ class _Draws:
 
 
 def _position_servos(model: mujoco.MjModel) -> dict[int, int]:
-    """The joint of each position servo of a hinge or slide joint.
+    """Number of the joint for the number of each position servo of a hinge or slide joint.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: the model has no such servo.
     """
     gain, kinds = model.actuator_gainprm[:, 0], mujoco.mjtJoint
     servo = (gain > 0.0) & (model.actuator_biasprm[:, 1] == -gain)
@@ -141,7 +141,17 @@ def _position_servos(model: mujoco.MjModel) -> dict[int, int]:
 
 
 def _chosen(setting: str, spreads: Mapping[str, Spread], names: list[str], kind: str) -> Iterator[tuple[int, Spread]]:
-    """Those of some named things that patterns mean, by number, and the distributions of their errors."""
+    """Numbers of the named things that patterns match, each with its distribution.
+
+    Args:
+        setting: name of the setting in `physics.randomize`.
+        spreads: distributions by pattern.
+        names: names of all things.
+        kind: what they are, for messages.
+
+    Raises:
+        ConfigError: a pattern matches nothing, or two match the same thing.
+    """
     key, taken = f"physics.randomize.{setting}", dict[int, str]()
     for pattern, spread in spreads.items():
         matching = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]

@@ -1,1 +1,1 @@
-"""How good is a policy? Deterministic evaluation of checkpoints, trials and whole experiments."""
+"""Deterministic evaluation of checkpoints, trials, whole experiments and zoos."""

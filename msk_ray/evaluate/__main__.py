@@ -4,12 +4,13 @@ import argparse
 import shutil
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msk_ray.cli import STORAGE, Parser, positive, run
 from msk_ray.compiling import announce_compiling
+from msk_ray.config import RandomizeConfig
 from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
 from msk_ray.evaluate.elsewhere import SCORINGS, Scorer, find_python, foreign_scoring
@@ -36,7 +37,7 @@ Evaluate a policy: without noise, from fixed initial states, under the environme
 Prints score, speed, falls, episode length and every reward term with its spread over episodes, and stores them in the
 trial's eval.json (for the policies in policies/ it only prints). For an experiment it evaluates the best policy of each
 trial, ranks the trials, and writes the ranking to the experiment's eval.json. Without options it repeats the evaluation
-that gave eval/score, by which trials are ranked: on the same device, every digit is the same. For policies/, or another
+that gave eval/score, by which trials are ranked; on the same device, every digit is the same. For policies/, or another
 folder that export --zoo wrote, it repeats the recorded evaluation of each policy and prints the table of its README."""
 
 EXAMPLES = """\
@@ -67,15 +68,15 @@ def parser() -> Parser:
         "--physics",
         metavar="LIST",
         help="comma-separated: reference (used for scores), own (used in training), or names from the environment "
-        "(default: reference, which is own where the environment names no physics)",
+        "(default: reference; if the environment names no physics, that is the same as own)",
     )
     p.add_argument("--vary", metavar="FIELD=LIST", help=HELP)
     p.add_argument(
         "--with",
         dest="conditions",
         metavar="LIST",
-        help="comma-separated harder conditions, evaluated in addition to the usual one: disturbed (by the trial's own "
-        "physics.randomize), push and weak for legs, and uphill, downhill and rough on myoleg26",
+        help="comma-separated harder conditions, evaluated after the usual one: disturbed (by the trial's own "
+        "physics.randomize); for legs also push and weak; for myoleg26 also uphill, downhill and rough",
     )
     p.add_argument(
         "--in",
@@ -102,16 +103,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser().parse_args(argv)
     target = find_target(args.target, args.storage)
     seeds = parse_seeds(args.seeds) if args.seeds is not None else None
-    names = [name.strip() for name in (args.physics or REFERENCE).split(",")]
-    varied = [None, *(parse_vary(args.vary) if args.vary is not None else [])]
-    python = _other_python(args)
+    variations = parse_vary(args.vary) if args.vary is not None else []
+    python = _foreign_python(args)
     if args.vary is not None and args.conditions is not None:
-        raise ConfigError("--with: it is for the model's own values; leave --vary out")
+        raise ConfigError("--with: conditions need the unchanged model; leave --vary out")
     if target.kind is Kind.ZOO:
         return _evaluate_zoo(target, args)
     if target.kind is not Kind.EXPERIMENT:
         best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
-    announce_compiling(f"evaluating {_what(target)}")
+    announce_compiling(f"evaluating {_description(target)}")
 
     from msk_ray.evaluate import measure
 
@@ -119,29 +119,44 @@ def main(argv: Sequence[str] | None = None) -> int:
     requests: Sequence[Request]
     if python is not None:
         scorer = foreign = foreign_scoring(args.elsewhere).scorer(python)
-        requests = foreign.requests(args.worlds, seeds, args.steps)
+        requests, group_size = foreign.requests(args.worlds, seeds, args.steps), 1
     else:
         from msk_ray.step.autograd.simulation import resolve_device
 
         device = args.device or measure.default_device()
         resolve_device(device)  # a missing device is not the fault of any trial
         scorer = measure.Bench(device, tell=True)
-        requests = [measure.Request(name, args.worlds, seeds, args.steps, v) for name in names for v in varied]
-        if args.conditions is not None:
-            under = [None, *(condition.strip() for condition in args.conditions.split(","))]
-            requests = [replace(request, condition=condition) for request in requests for condition in under]
-            varied = under
+        requests, group_size = _requests(args, seeds, variations)
     if target.kind is Kind.EXPERIMENT:
         return evaluate_experiment(Experiment(target.path), scorer, requests)
-    return _evaluate_one(target, scorer, requests, len(varied))
+    return _evaluate_one(target, scorer, requests, group_size)
+
+
+def _requests(
+    args: argparse.Namespace, seeds: tuple[int, ...] | None, variations: Sequence[RandomizeConfig]
+) -> "tuple[list[Request], int]":
+    """The requests for each physics: as usual, then with each variation or under each condition.
+
+    Returns:
+        The requests, and how many successive ones have the same physics.
+    """
+    from msk_ray.evaluate.measure import Request
+
+    physics = [name.strip() for name in (args.physics or REFERENCE).split(",")]
+    sizes = args.worlds, seeds, args.steps
+    if args.conditions is None:
+        varied = [None, *variations]
+        return [Request(name, *sizes, variation) for name in physics for variation in varied], len(varied)
+    conditions = [None, *(condition.strip() for condition in args.conditions.split(","))]
+    return [Request(name, *sizes, condition=c) for name in physics for c in conditions], len(conditions)
 
 
 def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
     """Evaluate the policies of a zoo, each as its entry says."""
     for option in ("worlds", "seeds", "steps", "physics", "vary", "conditions", "elsewhere", "python"):
         if getattr(args, option) is not None:
-            shown = {"elsewhere": "in", "conditions": "with"}.get(option, option)
-            raise ConfigError(f"--{shown}: the policies of {target.path} are evaluated as recorded there; leave it out")
+            flag = {"elsewhere": "in", "conditions": "with"}.get(option, option)
+            raise ConfigError(f"--{flag}: the policies of {target.path} are evaluated as recorded there; leave it out")
     zoo.read_zoo(target.path)  # torch and Warp take seconds to load; a damaged entry should not wait for them
     announce_compiling(f"evaluating the policies of {target.path} as recorded there")
 
@@ -153,17 +168,18 @@ def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
     return zoo.evaluate_zoo(target.path, measure.Bench(device, tell=True))
 
 
-def _what(target: Target) -> str:
+def _description(target: Target) -> str:
+    """What is evaluated, for the line that announces it."""
     if target.kind is not Kind.EXPERIMENT:
         return str(best_checkpoint(target))
     return f"the best policy of each of the {len(Experiment(target.path).trials())} trials of {target.path}"
 
 
-def _other_python(args: argparse.Namespace) -> Path | None:
-    """The Python of the environment that `--in` names; None without `--in`.
+def _foreign_python(args: argparse.Namespace) -> Path | None:
+    """The interpreter in which the package that `--in` names runs; None without `--in`.
 
     Raises:
-        ConfigError: there is none, or an option does not apply there.
+        ConfigError: there is no such interpreter, or an option does not go with `--in`.
     """
     if args.elsewhere is None:
         if args.python is not None:
@@ -171,13 +187,13 @@ def _other_python(args: argparse.Namespace) -> Path | None:
         return None
     for option in ("physics", "vary", "device", "conditions"):
         if getattr(args, option) is not None:
-            option = {"conditions": "with"}.get(option, option)
-            raise ConfigError(f"--{option}: --in {args.elsewhere} has its own physics, on the CPU; leave it out")
+            flag = {"conditions": "with"}.get(option, option)
+            raise ConfigError(f"--{flag}: --in {args.elsewhere} has its own physics and device; leave it out")
     return find_python(foreign_scoring(args.elsewhere), args.python)
 
 
-def _evaluate_one(target: Target, scorer: Scorer, requests: "Sequence[Request]", values: int) -> int:
-    """Evaluate one policy; each `values` successive requests have one physics and different values of a parameter."""
+def _evaluate_one(target: Target, scorer: Scorer, requests: "Sequence[Request]", group_size: int) -> int:
+    """Evaluate one policy, and print one table for each group of successive requests."""
     from msk_ray.training import load_policy
 
     path = best_checkpoint(target)
@@ -189,10 +205,10 @@ def _evaluate_one(target: Target, scorer: Scorer, requests: "Sequence[Request]",
         entries.append(scorer.evaluate(policy, request))
         if not is_shipped(path):
             store_evaluation(eval_file_of(path), entries[-1])
-        if values == 1:
+        if group_size == 1:
             print(policy_text(entries[-1]) + "\n")
-        elif len(entries) % values == 0:
-            print(vary_text(entries[-values:]) + "\n")
+        elif len(entries) % group_size == 0:
+            print(vary_text(entries[-group_size:]) + "\n")
     if not is_shipped(path):
         print(f"written into {eval_file_of(path)}")
     return 0
@@ -238,54 +254,80 @@ def evaluate_experiment(experiment: Experiment, scorer: Scorer, requests: "Seque
 
     Returns:
         The exit code: 1 if a policy could not be evaluated.
-    """
-    from msk_ray.training import load_policy
 
-    trials = experiment.trials()
-    groups = by_environment(trials, lambda trial: trial.environment)
+    Raises:
+        CheckpointError: no policy could be evaluated.
+    """
+    groups = by_environment(experiment.trials(), lambda trial: trial.environment)
     for request in requests:
         for group in groups.values():
             scorer.check(group[0].config, request)
-    rankings: dict[tuple[int, str], list[dict[str, Any]]] = {}
-    failed: dict[str, str] = {}
-    untrained: dict[str, str] = {}
-    for position, request in enumerate(requests):
-        for number, trial in enumerate(trials, start=1):
-            try:
-                path = best_of_trial(experiment.trial_folder(trial.id))
-                if read_facts(path).get("epoch") == 0:
-                    untrained[trial.id] = f"{path} is the untrained policy; it has no rank"
-                    print(f"{number}/{len(trials)}  {trial.id}  {untrained[trial.id]}", flush=True)
-                    continue
-                entry = scorer.evaluate(load_policy(path), request)
-                store_evaluation(eval_file_of(path), entry)
-            except MskRayError as error:
-                failed[trial.id] = str(error)
-                print(f"{number}/{len(trials)}  {trial.id}  {printable(str(error))}", flush=True)
-                continue
-            name = trial.variant + read_attempt(experiment.trial_folder(trial.id)).suffix
-            ranked = {"trial": trial.id, "variant": name, "seed": trial.seed, **entry}
-            rankings.setdefault((position, trial.environment), []).append(ranked)
-            print(f"{number}/{len(trials)}  {trial.id}  {entry['score']['mean']:.5g}", flush=True)
-    for entries in rankings.values():
-        entries.sort(key=lambda entry: -entry["score"]["mean"])
-    if not rankings:
-        why = next(iter([*failed.values(), *untrained.values()]), "it has no trials")
+    results = _evaluate_trials(experiment, scorer, requests)
+    if not results.rankings:
+        why = next(iter([*results.failed.values(), *results.untrained.values()]), "it has no trials")
         raise CheckpointError(f"no policy of {experiment.path} could be evaluated; the first: {why}")
-    missing = [{"trial": trial, "why": why} for trial, why in failed.items()]
     path = experiment.path / EVAL_FILE
-    listed = [
-        {"environment": environment, "physics": entries[0]["physics"], "ranking": entries}
-        for (_, environment), entries in rankings.items()
-    ]
-    left_out = {"failed": missing, "untrained": sorted(untrained)}
-    write_json(path, {"format": FORMAT, "experiment": experiment.name, "rankings": listed, **left_out})
+    write_json(path, {"format": FORMAT, "experiment": experiment.name, **results.as_json()})
     width = max(100, shutil.get_terminal_size((160, 24)).columns)
-    for (_, environment), entries in rankings.items():
+    for (_, environment), entries in results.rankings.items():
         where = f"{printable(environment)} " if len(groups) > 1 else ""
         print(f"\n{where}under {entries[0]['physics']} physics\n{ranking_text(entries, width)}")
     print(f"\nwritten into {path}")
-    return 1 if failed else 0
+    return 1 if results.failed else 0
+
+
+@dataclass(frozen=True)
+class _ExperimentResults:
+    """Results of the best policies of an experiment."""
+
+    rankings: dict[tuple[int, str], list[dict[str, Any]]] = field(default_factory=dict)
+    """Entries of `eval.json`, best first, by number of the request and environment."""
+    failed: dict[str, str] = field(default_factory=dict)
+    """Why a policy could not be evaluated, by trial."""
+    untrained: dict[str, str] = field(default_factory=dict)
+    """A line for each trial that has only its untrained policy."""
+
+    def as_json(self) -> dict[str, Any]:
+        """What `eval.json` says about them."""
+        return {
+            "rankings": [
+                {"environment": environment, "physics": entries[0]["physics"], "ranking": entries}
+                for (_, environment), entries in self.rankings.items()
+            ],
+            "failed": [{"trial": trial, "why": why} for trial, why in self.failed.items()],
+            "untrained": sorted(self.untrained),
+        }
+
+
+def _evaluate_trials(experiment: Experiment, scorer: Scorer, requests: "Sequence[Request]") -> _ExperimentResults:
+    """Evaluate the best policy of each trial for each request, with a line of output for each."""
+    from msk_ray.training import load_policy
+
+    results = _ExperimentResults()
+    trials = experiment.trials()
+    for request_number, request in enumerate(requests):
+        for number, trial in enumerate(trials, start=1):
+            folder = experiment.trial_folder(trial.id)
+            entry = None
+            try:
+                path = best_of_trial(folder)
+                if read_facts(path).get("epoch") == 0:
+                    outcome = results.untrained[trial.id] = f"{path} is the untrained policy; it has no rank"
+                else:
+                    entry = scorer.evaluate(load_policy(path), request)
+                    store_evaluation(eval_file_of(path), entry)
+                    outcome = f"{entry['score']['mean']:.5g}"
+            except MskRayError as error:
+                entry, outcome = None, printable(str(error))
+                results.failed[trial.id] = str(error)
+            if entry is not None:
+                name = trial.variant + read_attempt(folder).suffix
+                ranked = {"trial": trial.id, "variant": name, "seed": trial.seed, **entry}
+                results.rankings.setdefault((request_number, trial.environment), []).append(ranked)
+            print(f"{number}/{len(trials)}  {trial.id}  {outcome}", flush=True)
+    for entries in results.rankings.values():
+        entries.sort(key=lambda entry: -entry["score"]["mean"])
+    return results
 
 
 def ranking_text(ranking: Sequence[dict[str, Any]], width: int) -> str:

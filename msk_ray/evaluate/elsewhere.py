@@ -1,4 +1,4 @@
-"""`evaluate --in NAME`: scoring in another package's environment, which has an interpreter of its own.
+"""`evaluate --in NAME`: evaluation in another package's environment, which runs in its own Python.
 
 A package declares one in the entry-point group `msk_ray.scoring`. Imports no torch: the command line reads it.
 """
@@ -31,10 +31,10 @@ class Scorer(Protocol):
 
 
 class ForeignScorer(Scorer, Protocol):
-    """Evaluates policies in another package."""
+    """Evaluates policies in another package's environment."""
 
     def requests(self, worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> "Sequence[Request]":
-        """Requests for these numbers of worlds, seeds and steps; None: as is usual there.
+        """Requests with these numbers of worlds, seeds and steps; None: the number that is usual there.
 
         Raises:
             ConfigError: it does not support one of the numbers.
@@ -43,29 +43,29 @@ class ForeignScorer(Scorer, Protocol):
 
 @dataclass(frozen=True)
 class ForeignScoring:
-    """An entry point in the group `msk_ray.scoring` names one."""
+    """Another package in which policies can be evaluated. An entry point in the group `msk_ray.scoring` names one."""
 
     name: str
-    """As `--in` takes it, and its folder."""
+    """Name for `--in`, for the installed package, and for the folder of its virtual environment."""
     package: str
-    """Its name in sentences."""
+    """Name of the package in sentences."""
     version: str
-    """Its version that has these environments, without the last number."""
+    """Version of the package that has these environments, without its last number."""
     requirement: str
-    """What pip installs."""
+    """The package as pip takes it."""
     summary: str
-    """For `--help`: which policies it evaluates, and in which environment."""
+    """A line for `--help`: which policies are evaluated, and in which environment."""
     scorer_class: str
-    """Import path of its `ForeignScorer`, which is made with the path of an interpreter."""
+    """Import path of a `ForeignScorer` whose constructor takes the path of an interpreter."""
 
     @property
     def python(self) -> Path:
-        """Path of its interpreter, unless `--python` names another."""
+        """Path of the package's interpreter, unless `--python` names another one."""
         return Path(f".{self.name}/bin/python")
 
     @property
     def install(self) -> str:
-        """How a user installs it."""
+        """How a user installs the package, as part of an error message."""
         return (
             f"install {self.package} beside msk_ray: python -m venv .{self.name} && .{self.name}/bin/pip install "
             f"{self.requirement}, then --python {self.python}"

@@ -1,4 +1,4 @@
-"""The process of another Python in which a package's environment runs, spoken to through its standard streams."""
+"""A process of another Python that runs another package's environment, and exchanges bytes through standard streams."""
 
 import json
 import subprocess
@@ -16,31 +16,31 @@ from msk_ray.evaluate.elsewhere import ForeignScoring
 
 
 class ForeignProcess(AbstractContextManager["ForeignProcess"]):
-    """A script that greets with one line of JSON, then reads actions and answers with records.
+    """A process that first writes one line of JSON, then reads actions and answers with records.
 
-    It is ended on exit, if it has not ended by itself.
+    On exit it is killed if it is still running.
 
     Args:
-        scoring: of the package.
+        scoring: the package.
         python: the interpreter.
-        script: path of the script.
-        asked: what it is asked for, its only argument.
+        script: path of the script that the process runs.
+        order: what to run; the script's only argument, as JSON.
 
     Attributes:
-        hello: what it greeted with.
-        versions: of the packages there, a part of that.
+        hello: content of the first line.
+        versions: versions of the packages there, from the first line.
 
     Raises:
-        ConfigError: it ended before it had greeted, or the package has another version.
+        ConfigError: the process ended before its first line, or the package has another version.
     """
 
-    def __init__(self, scoring: ForeignScoring, python: Path, script: str, asked: dict[str, Any]) -> None:
+    def __init__(self, scoring: ForeignScoring, python: Path, script: str, order: dict[str, Any]) -> None:
         self._name = scoring.name
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115  # closed on exit
         self._process = subprocess.Popen(
             # Isolated: beside the script may lie a module called like the package, and PYTHONPATH is meant for our
             # versions.
-            [str(python), "-I", script, json.dumps(asked)],
+            [str(python), "-I", script, json.dumps(order)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._messages,
@@ -51,10 +51,10 @@ class ForeignProcess(AbstractContextManager["ForeignProcess"]):
                 raise ConfigError(f"--in {self._name}: {self._last_words()}; {scoring.install}")
             self.hello: dict[str, Any] = json.loads(line)
             self.versions: dict[str, str] = self.hello["versions"]
-            found = self.versions[scoring.name]
-            if not found.startswith(f"{scoring.version}."):
+            version = self.versions[scoring.name]
+            if not version.startswith(f"{scoring.version}."):
                 raise ConfigError(
-                    f"--in {scoring.name}: {scoring.package} {found} has other tasks than {scoring.version}.x; "
+                    f"--in {scoring.name}: {scoring.package} {version} has other tasks than {scoring.version}.x; "
                     f"{scoring.install}"
                 )
         except BaseException:
@@ -67,10 +67,10 @@ class ForeignProcess(AbstractContextManager["ForeignProcess"]):
         return self._process.stdout
 
     def write(self, actions: NDArray[np.floating]) -> None:
-        """Send actions, as float32.
+        """Send actions as float32.
 
         Raises:
-            SimulationError: it has ended.
+            SimulationError: the process has ended.
         """
         assert self._process.stdin is not None
         try:
@@ -83,7 +83,7 @@ class ForeignProcess(AbstractContextManager["ForeignProcess"]):
         """The next `count` records, (count, ...).
 
         Raises:
-            SimulationError: it has ended.
+            SimulationError: the process has ended.
         """
         size = count * record.itemsize
         data = self._out.read(size)
@@ -97,8 +97,8 @@ class ForeignProcess(AbstractContextManager["ForeignProcess"]):
         self._process.wait()
         self._messages.seek(0)
         lines = self._messages.read().decode(errors="replace").split("\n")
-        said = [line.strip() for line in lines if line.strip()]
-        return said[-1] if said else f"it ended with exit code {self._process.returncode}"
+        messages = [line.strip() for line in lines if line.strip()]
+        return messages[-1] if messages else f"it ended with exit code {self._process.returncode}"
 
     def __enter__(self) -> Self:
         return self

@@ -1,4 +1,4 @@
-"""Evaluate a policy under one physics: results with their spread over episodes."""
+"""Evaluation of a policy under one physics, with the spread of the results over episodes."""
 
 import datetime
 import platform
@@ -23,13 +23,13 @@ from msk_ray.training.out_of_memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
 DISTURBED = "disturbed"
-"""The condition of a trial that it trains under, its `physics.randomize`."""
+"""The condition under which a trial trains: its own `physics.randomize`."""
 _PACKAGES = ("msk-ray", "torch", "warp-lang", "mujoco", "mujoco-warp")
 
 
 @dataclass(frozen=True)
 class Request:
-    """How to evaluate. None: as in the trial's own evaluation."""
+    """How to evaluate a policy. None: as in its trial's own evaluation."""
 
     physics: str = REFERENCE
     """`reference`, `own` (what the trial trains on), or a named physics of the environment."""
@@ -43,17 +43,17 @@ class Request:
 
 
 def under_condition(config: Config, name: str) -> tuple[Config, RandomizeConfig | None]:
-    """A config changed to one of its environment's conditions, and what is drawn under it.
+    """A config changed to a harder condition of its environment, and the random parameters under that condition.
 
     Raises:
-        ConfigError: there is no such condition.
+        ConfigError: the environment has no such condition.
     """
     known, drawn = config.env.conditions, config.physics.randomize
     if name == DISTURBED and drawn is not None:
         return config, drawn
     if name not in known:
-        there = [*known, *([DISTURBED] if drawn is not None else [])]
-        instead = f"has {', '.join(there)}; write one of these, or leave it out" if there else "has none; leave it out"
+        names = [*known, *([DISTURBED] if drawn is not None else [])]
+        instead = f"has {', '.join(names)}; write one of these, or leave it out" if names else "has none; leave it out"
         raise ConfigError(f"--with {name}: a trial of env {config.env.name} {instead}")
     values = {key: value for key, value in known[name].items() if key != "physics.randomize"}
     harder = parse_config(overlay(config.as_dict(), values)) if values else config
@@ -62,7 +62,7 @@ def under_condition(config: Config, name: str) -> tuple[Config, RandomizeConfig 
 
 
 def named_physics(config: Config, name: str) -> tuple[str, PhysicsConfig]:
-    """The name to show of a trial's physics, and the physics.
+    """The physics that `--physics NAME` means for a trial: the name to print, and the settings.
 
     Raises:
         ConfigError: the environment has no physics of that name.
@@ -103,21 +103,23 @@ class Bench:
         Raises:
             ConfigError, DeviceError, UnsupportedModelError, SimulationError: as their messages say.
         """
-        shown, physics = named_physics(config, request.physics)
+        physics_name, physics = named_physics(config, request.physics)
         changes = {"nworld": request.worlds, "steps": request.steps}
-        own = config.evaluation.model_copy(update={k: v for k, v in changes.items() if v is not None})
-        config = config.model_copy(update={"evaluation": own})
+        evaluation = config.evaluation.model_copy(update={k: v for k, v in changes.items() if v is not None})
+        config = config.model_copy(update={"evaluation": evaluation})
         settings = env_class(config.env).reference_settings(config.env)
-        sizes = (own.nworld, own.steps, own.seed)
+        sizes = (evaluation.nworld, evaluation.steps, evaluation.seed)
         key = repr((settings, physics, request.varied, sizes, config.execution))
         if key not in self._evaluators:
-            with named_out_of_memory(self._device, own.nworld, *_WORLDS):
+            with named_out_of_memory(self._device, evaluation.nworld, *_WORLDS):
                 self._evaluators[key] = Evaluator(config, self._device, physics, request.varied)
-        return self._evaluators[key], shown if request.varied is None else f"{shown}, {request.varied}"
+        if request.varied is not None:
+            physics_name = f"{physics_name}, {request.varied}"
+        return self._evaluators[key], physics_name
 
     def check(self, config: Config, request: Request) -> None:
-        """Raise ConfigError if a trial's environment does not have the requested physics or condition, or its model
-        not the parameter to change. Runs nothing."""
+        """Raise ConfigError if a trial's environment lacks the requested physics or condition, or its model lacks the
+        parameter to change. Runs nothing."""
         if request.condition is not None:
             under_condition(config, request.condition)
         _, physics = named_physics(config, request.physics)
@@ -140,15 +142,15 @@ class Bench:
             MskRayError: as for `evaluator`, or the checkpoint does not fit its environment.
         """
         use_threads(policy.config)
-        asked, config = request, policy.config
+        config, conditioned = policy.config, request
         if request.condition is not None:
             config, varied = under_condition(config, request.condition)
-            asked = replace(request, varied=varied)
-        evaluator, physics = self.evaluator(config, asked)
+            conditioned = replace(request, varied=varied)
+        evaluator, physics = self.evaluator(config, conditioned)
         if request.condition is not None:
             physics = f"{physics.partition(',')[0]}, {request.condition}"
-        own = policy.config.evaluation
-        seeds = request.seeds or (own.seed,)
+        trial_evaluation = policy.config.evaluation
+        seeds = request.seeds or (trial_evaluation.seed,)
         with named_out_of_memory(self._device, evaluator.env.nworld, *_WORLDS):
             runs = [
                 evaluator.episodes(policy.on(evaluator.env), seed, pace=self.pace(evaluator.steps)) for seed in seeds
@@ -157,9 +159,9 @@ class Bench:
         canonical = (
             request.varied is None
             and request.condition is None
-            and evaluator.env.nworld == own.nworld
-            and seeds == (own.seed,)
-            and request.steps in (None, own.steps or policy.config.env.episode_length)
+            and evaluator.env.nworld == trial_evaluation.nworld
+            and seeds == (trial_evaluation.seed,)
+            and request.steps in (None, trial_evaluation.steps or policy.config.env.episode_length)
             and named_physics(policy.config, request.physics)[1] == reference
         )
         setup = EvaluationSetup(

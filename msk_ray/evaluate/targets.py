@@ -1,5 +1,5 @@
-"""What commands take as a target: a checkpoint, a trial's folder, an experiment, or a folder of policies; and as a
-physics."""
+"""What commands take as their target (a checkpoint, a trial's folder, an experiment, or a folder of policies), and the
+names of physics."""
 
 import difflib
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from msk_ray.experiment.records import best_records, find_experiments, read_reco
 from msk_ray.shipped import POLICIES, find_shipped, shipped_folder, shipped_names
 
 REFERENCE, OWN = "reference", "own"
-"""The physics that scores are taken under, and the one that a trial trains on; `--physics` takes these and the names of
-the environment's own."""
+"""Names that `--physics` takes besides those of the environment: the physics of scores, and the physics of the trial's
+training."""
 
 
 class Kind(StrEnum):
@@ -110,10 +110,10 @@ def best_trial_folder(target: Target) -> Path:
             "look at its untrained policy"
         )
     if len(bests) > 1:
-        each = ", ".join(f"{best.folder} ({name})" for name, best in bests.items())
+        choices = ", ".join(f"{best.folder} ({name})" for name, best in bests.items())
         raise CheckpointError(
             f"{target.path} has a best trial for each environment, because their scores cannot be compared; give one "
-            f"of them: {each}"
+            f"of them: {choices}"
         )
     (best,) = bests.values()
     return best.folder

@@ -17,10 +17,10 @@ HELP = (
 
 
 def parse_vary(text: str) -> list[RandomizeConfig]:
-    """One section for each value of `--vary`.
+    """One section `physics.randomize` for each value of `--vary`, with the field at that value.
 
     Raises:
-        ConfigError: there is no such field, or a value is no positive number.
+        ConfigError: there is no such field, or a value is not a positive number.
     """
     name, equals, values = text.partition("=")
     known = list(ModelRandomization.model_fields)
@@ -30,6 +30,7 @@ def parse_vary(text: str) -> list[RandomizeConfig]:
 
 
 def _at(name: str, value: str) -> RandomizeConfig:
+    """A section with one field at one value, such as "0.8", or at a multiple, such as "0.8x"."""
     scale = value.endswith("x")
     try:
         number = float(value.removesuffix("x"))
@@ -46,18 +47,18 @@ def _at(name: str, value: str) -> RandomizeConfig:
 
 
 def vary_text(entries: Sequence[dict[str, Any]]) -> str:
-    """Evaluations with the unchanged model and with other values, for a terminal.
+    """Evaluations of one policy with the unchanged model and with other values, for a terminal.
 
     Args:
-        entries: of one policy; the first is with the unchanged model.
+        entries: entries of `eval.json`; the first is with the unchanged model.
     """
-    own, outcomes = entries[0]["score"]["mean"], list(entries[0]["outcomes"])
+    unchanged, outcomes = entries[0]["score"]["mean"], list(entries[0]["outcomes"])
     rows = [
         (
             entry["physics"],
             f"{entry['score']['mean']:.5g}",
             f"{entry['score']['std']:.3g}",
-            f"{entry['score']['mean'] / own:.0%}" if own > 0.0 else "-",
+            f"{entry['score']['mean'] / unchanged:.0%}" if unchanged > 0.0 else "-",
             f"{entry['length']['mean']:.0f}",
             f"{entry['fall_rate']:.0%}",
             *(f"{entry['outcomes'][name]['mean']:.3g}" for name in outcomes),

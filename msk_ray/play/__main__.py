@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from msk_ray.play.screen import Screen
 
 DESCRIPTION = """\
-Watch a task, one episode after the other: in MuJoCo's viewer, or with --browser on a page that only this machine can
-reach. From another machine, ssh -L 8080:127.0.0.1:8080 HOST makes it yours.
+Watch a task, one episode after the other, in MuJoCo's viewer, or with --browser on a page that only this machine can
+reach. To see the page from another machine, run ssh -L 8080:127.0.0.1:8080 HOST there.
 
-msk-ray list names the tasks. Episodes are as in evaluation: without noise, under reference physics unless --physics
-says otherwise. Contact forces are arrows (in the browser once they are switched on), muscles go from blue (relaxed) to
-red (active). msk-ray visualize makes films and pictures."""
+msk-ray list names the tasks. Episodes are as in evaluation: without noise, and under reference physics unless --physics
+says otherwise. Arrows are contact forces (in the browser, switch them on); muscles are blue when relaxed and red when
+active. To make films and pictures, use msk-ray visualize."""
 
 EXAMPLES = """\
   python -m msk_ray.play ant                             # its best policy in policies/
@@ -45,7 +45,9 @@ _PORT = 8080
 def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.play", DESCRIPTION, EXAMPLES)
-    p.add_argument("task", nargs="?", metavar="TASK", help="a task (default: that of the policy of --agent)")
+    p.add_argument(
+        "task", nargs="?", metavar="TASK", help="a task (default: the task of the policy that --agent names)"
+    )
     p.add_argument(
         "--agent",
         default=ZOO,
@@ -61,12 +63,14 @@ def parser() -> Parser:
         "--episodes", type=positive, metavar="N", help="number of episodes (default: until the window is closed)"
     )
     p.add_argument("--steps", type=positive, metavar="N", help="maximum env steps per episode")
-    p.add_argument("--seed", type=int, metavar="N", help="seed of the initial states (default: that of evaluations)")
+    p.add_argument(
+        "--seed", type=int, metavar="N", help="seed of the initial states (default: the seed of evaluations)"
+    )
     p.add_argument(
         "--physics",
         default=REFERENCE,
         metavar="NAME",
-        help="reference (used for scores), own (used in training), or the name of one (default: reference)",
+        help="reference (used for scores), own (used in training), or a name from the environment (default: reference)",
     )
     p.add_argument(
         "--speed", type=float, default=1.0, metavar="X", help="simulated seconds per second (default: 1, real time)"

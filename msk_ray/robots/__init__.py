@@ -1,5 +1,5 @@
 """Legged robots that follow velocity commands: Unitree's Go1 and G1 in the tasks of mjlab, and scoring in mjlab.
 
-A plug-in: the runner finds everything here by the entry points of this distribution, as it finds another package's, and
-imports nothing of it.
+A plug-in: the runner imports nothing from here. It finds everything through the entry points of this distribution, just
+as it finds the plug-ins of other packages.
 """

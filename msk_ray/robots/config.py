@@ -14,13 +14,13 @@ from msk_ray.envs.mjcf.config import MjcfSettings
 
 
 def velocity_command(forward: tuple[float, float], turn: tuple[float, float]) -> Command:
-    """Velocity forward, in a range, and to the left [m/s], yaw rate, in a range [rad/s], and heading [rad]."""
+    """The command `velocity` with these ranges of forward velocity [m/s] and yaw rate [rad/s]."""
     ranges = {
         "lin_vel_x": forward,
         "lin_vel_y": (-1.0, 1.0),
         "ang_vel_z": turn,
         "heading": (-math.pi, math.pi),
-        # Below a share of mjlab's, the command is another: see `VelocityEnv.velocity_command`.
+        # Compared with mjlab's shares of special commands: see `VelocityEnv.velocity_command`.
         "stand": (0.0, 1.0),
         "go_ahead": (0.0, 1.0),
         "turn_to_heading": (0.0, 1.0),
@@ -29,23 +29,23 @@ def velocity_command(forward: tuple[float, float], turn: tuple[float, float]) ->
 
 
 VELOCITY = velocity_command((-1.5, 2.0), (-0.7, 0.7))
-"""In the ranges that mjlab evaluates with on flat ground."""
+"""The command with the ranges that mjlab evaluates with on flat ground."""
 ROUGH_VELOCITY = velocity_command((-1.0, 1.0), (-0.5, 0.5))
-"""In those on rough ground."""
+"""The command with its ranges on rough ground."""
 
 
 class VelocityShape(Reward):
     """The settings of terms other than their weights."""
 
     tail: Fraction = 0.0
-    """Share of 1/(1 + x) in the terms `track_linear_velocity` and `track_angular_velocity`, which are e^−x in scores:
-    that has no slope far from the command. For training."""
+    """Share of 1/(1 + x) in the terms `track_linear_velocity` and `track_angular_velocity`, for training. In scores
+    they are e^−x, which has no slope far from the command."""
     pose_tail: Fraction = 0.0
-    """The same share in `pose`, `upright` and `base_height`, which have no slope far away. For training."""
+    """The same for the terms `pose`, `upright` and `base_height`."""
 
 
 def velocity_terms(*others: Term) -> tuple[Term, ...]:
-    """mjlab's terms with its weights, but for those that differ between its robots."""
+    """The terms that all robots of mjlab share, with its weights, and `others`."""
     return terms_in(
         "msk_ray.robots.terms",
         Term("track_linear_velocity", 2.0),
@@ -67,8 +67,8 @@ class ServoSettings(MjcfSettings):
     """A robot whose joints are turned by position servos."""
 
     action_range: PositiveFloat = 1.0
-    """mjlab's action for an action of 1 of the policy. mjlab's are not bounded; 1 asks a joint for an angle that its
-    servo, standing still, holds with a quarter of its largest torque."""
+    """mjlab's action for a policy's action of 1. mjlab's actions have no bound; an action of 1 moves the target of a
+    servo so far that it starts with a quarter of its largest torque."""
 
 
 @with_commands(VELOCITY)
@@ -79,8 +79,8 @@ class VelocitySettings(ServoSettings):
     reset_noise: NonNegative = 0.0
     reset_velocity_noise: NonNegative = 0.0
     termination_height: NonNegative = 0.0
-    """In training, episodes also end when the base is lower than this [m]; 0: they do not. A robot that has sunk into a
-    crouch seldom finds a way out of it. Not in scores."""
+    """In training, episodes also end when the base is lower than this [m], because a robot that has sunk into a crouch
+    seldom gets out of it; 0: they do not. Scores ignore it."""
     command_schedule: CommandSchedule | None = None
     """Factor on the ranges of the commanded velocity and yaw rate in training; null: 1."""
     cost_schedule: CostSchedule | None = None

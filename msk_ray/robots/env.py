@@ -1,6 +1,6 @@
 """Legged robots that follow commands for their velocity. Source: `mjlab/tasks/velocity` of mjlab 1.6.0.
 
-Axes: W worlds, J joints but for the free one, F feet.
+Axes: W worlds, J joints except the free one, F feet.
 """
 
 import math
@@ -32,23 +32,23 @@ from msk_ray.step.autograd.tangent import quat_conjugate, quat_multiply, quat_ro
 AnyVelocitySettings = TypeVar("AnyVelocitySettings", bound=VelocitySettings)
 
 _FALLEN = math.radians(70.0)
-"""Tilt of the base from which an episode ends."""
-_START = torch.tensor([0.5, 0.5, 0.02, math.pi])
-"""Half the range of the initial position [m] and yaw [rad]."""
+"""Tilt of the base at which an episode ends [rad]."""
+_START_NOISE = torch.tensor([0.5, 0.5, 0.02, math.pi])
+"""Largest noise of the initial position [m] and yaw [rad]."""
 _START_HEIGHT = 0.03
 """Mean height of initial states above the keyframe [m]."""
-_SLOW, _FAST = 0.05, 1.5
-"""Commands, in m/s plus rad/s, from which it walks and runs."""
+_WALKING, _RUNNING = 0.05, 1.5
+"""Commanded speeds, in m/s plus rad/s, from which the robot should walk and run."""
 _SHARES = (0.1, 0.2, 0.3)
-"""Of commands to stand, to walk straight ahead, and to turn to a heading."""
+"""Shares of commands to stand, to go straight ahead, and to turn to a heading."""
 _SLOWEST_AHEAD = 0.3
-"""Smallest command straight ahead [m/s]."""
-_HEADING_STIFFNESS = 0.5
-"""Yaw rate asked for per error of the heading [1/s]."""
+"""Smallest command to go straight ahead [m/s]."""
+_HEADING_GAIN = 0.5
+"""Commanded yaw rate for an error in heading of 1 rad [1/s]."""
 
 
 _SENSORS = {"imu_lin_vel": "velocimeter", "imu_ang_vel": "gyro", "root_angmom": "subtreeangmom"}
-"""Sensors of the observation and, the last, of the term `angular_momentum`."""
+"""Types of the sensors that a model needs: the first two for the observation, the last for `angular_momentum`."""
 
 
 class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
@@ -66,18 +66,18 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     3       direction of gravity in the axes of the base
     J       angles of the joints minus those of the default pose [rad]
     J       their rates [rad/s]
-    J       last action, as mjlab counts it
+    J       last action, in mjlab's units
     3       command: velocity forward and to the left [m/s], yaw rate [rad/s]
     ======= ==========================================================================
 
-    The critic sees the same, undisturbed. mjlab's also sees contacts, forces and air times of the feet, which have no
-    gradient: robots learned more slowly with them (lab/robots.md).
+    The critic sees the same without noise and delays. mjlab's critic also sees contacts, forces and air times of the
+    feet, which have no gradient: robots learned more slowly with them (lab/robots.md).
 
     An action turns the targets of the servos away from the default pose; see `control`. Actions and joints are in the
     order of the MJCF's joints, not in that of its actuators.
 
-    The reward is that of mjlab per second, which multiplies it by the 0.02 s of a step. mjlab measures bodies for it
-    5 ms before the end of a step; here they are measured at the end.
+    The reward is mjlab's per second: mjlab multiplies it by the 0.02 s of a step. mjlab measures bodies 5 ms before the
+    end of a step; here they are measured at its end.
     """
 
     Settings = VelocitySettings  # type: ignore[assignment]
@@ -92,32 +92,32 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
             [by_joint(values, self.joint_names) for values in (spread.standing, spread.walking, spread.running)],
             device=self.device,
         )
-        self._start_range = _START.to(self.device)
-        self._widest = self.command_ranges["velocity"][:, :3].clone()
+        self._start_noise = _START_NOISE.to(self.device)
+        self._full_ranges = self.command_ranges["velocity"][:, :3].clone()
 
     def _check_names(self) -> None:
-        """Raise ConfigError if the model lacks any of the names of `robot`, saying all that are missing.
+        """Raise ConfigError if the model lacks parts that `robot` names, listing all that is missing.
 
-        Sensors are for `observe`, which a class may write without them.
+        Missing sensors alone are no error until `observe` reads them, because a class may override it.
         """
         terms = {term.name for term in self.active_terms}
-        wanted = {name: kind for name, kind in _SENSORS.items() if name != "root_angmom" or "angular_momentum" in terms}
-        sensors = missing("sensor", wanted, self.model)
-        self._no_sensors = sensors and f"the model of {type(self).__qualname__} has {sensors}"
+        needed = {name: kind for name, kind in _SENSORS.items() if name != "root_angmom" or "angular_momentum" in terms}
+        missing_sensors = missing("sensor", needed, self.model)
+        self._sensor_error = missing_sensors and f"the model of {type(self).__qualname__} has {missing_sensors}"
         if parts := missing_parts(self.robot, self.model):
-            every = "; ".join([*parts, *([sensors] if sensors else [])])
-            raise ConfigError(f"the model of {type(self).__qualname__} lacks what its robot names: {every}")
+            lacking = "; ".join([*parts, *([missing_sensors] if missing_sensors else [])])
+            raise ConfigError(f"the model of {type(self).__qualname__} lacks what its robot names: {lacking}")
 
     def apply_schedules(self, epoch: int) -> None:
         super().apply_schedules(epoch)
         if (schedule := self.config.command_schedule) is not None:
-            torch.mul(self._widest, schedule.at(epoch), out=self.command_ranges["velocity"][:, :3])
+            torch.mul(self._full_ranges, schedule.at(epoch), out=self.command_ranges["velocity"][:, :3])
 
     # Episodes
 
     def draw_physics(self, count: int) -> StepState:
         start = super().draw_physics(count)
-        shift = self._start_range * self.uniform(count, 4)
+        shift = self._start_noise * self.uniform(count, 4)
         turn = torch.zeros((count, 4), device=self.device)
         turn[:, 0], turn[:, 3] = torch.cos(shift[:, 3] / 2.0), torch.sin(shift[:, 3] / 2.0)
         position = start.qpos[:, :3] + shift[:, :3]
@@ -142,7 +142,7 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         return state.qpos[:, 2]
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
-        """`linear_error` [m/s] and `yaw_error` [rad/s] are distances of the base's velocities from the command."""
+        """`linear_error` [m/s] and `yaw_error` [rad/s]: differences between the base's velocity and the command."""
         command = self.velocity_command()
         linear, angular = self.base_velocities(state)
         return {
@@ -153,16 +153,16 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     # What terms and observation use
 
     def velocity_command(self) -> Tensor:
-        """Velocity forward and to the left [m/s] and yaw rate [rad/s] asked for in the current state, (W, 3)."""
-        forward, left, turn, heading, *chances = self.command("velocity").unbind(-1)
-        stands, goes_ahead, turns = (chance < share for chance, share in zip(chances, _SHARES, strict=True))
+        """Commanded velocity forward and to the left [m/s], and yaw rate [rad/s], in the current state, (W, 3)."""
+        forward, left, turn, heading, *draws = self.command("velocity").unbind(-1)
+        stands, goes_ahead, turns = (draw < share for draw, share in zip(draws, _SHARES, strict=True))
         w, x, y, z = self.state.physics.qpos[:, 3:7].unbind(-1)
         error = heading - torch.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
         error = torch.remainder(error + math.pi, 2.0 * math.pi) - math.pi
-        toward = (_HEADING_STIFFNESS * error).clamp(*self.command_ranges["velocity"][:, 2])
+        turn_to_heading = (_HEADING_GAIN * error).clamp(*self.command_ranges["velocity"][:, 2])
         forward = torch.where(goes_ahead, forward.abs().clamp_min(_SLOWEST_AHEAD), forward)
         left, turn = left.masked_fill(goes_ahead, 0.0), turn.masked_fill(goes_ahead, 0.0)
-        command = torch.stack((forward, left, torch.where(turns, toward, turn)), dim=-1)
+        command = torch.stack((forward, left, torch.where(turns, turn_to_heading, turn)), dim=-1)
         return command.masked_fill(stands[:, None], 0.0)
 
     def commanded_speed(self) -> Tensor:
@@ -172,12 +172,12 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     def is_commanded(self) -> Tensor:
         """1 where the robot is to move, else 0, (W,)."""
-        return (self.commanded_speed() > _SLOW).float()
+        return (self.commanded_speed() > _WALKING).float()
 
     def pose_spread(self) -> Tensor:
-        """Spread of the joints about the default pose that the command allows [rad], (W, J)."""
+        """Spread of joint angles about the default pose that `pose` tolerates at the commanded speed [rad], (W, J)."""
         speed = self.commanded_speed()
-        return self._spreads[(speed >= _SLOW).long() + (speed >= _FAST).long()]
+        return self._spreads[(speed >= _WALKING).long() + (speed >= _RUNNING).long()]
 
     def base_velocities(self, state: StepState) -> tuple[Tensor, Tensor]:
         """Velocity [m/s] and angular velocity [rad/s] of the base in its own axes, each (W, 3)."""
@@ -186,7 +186,7 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         return quat_rotate(into_base, frames.velocity(base)), quat_rotate(into_base, frames.angular_velocity(base))
 
     def foot_heights(self, state: StepState) -> Tensor:
-        """Heights of the feet above the ground [m], (W, F); 0 below it."""
+        """Heights of the feet above the ground [m], at least 0, (W, F)."""
         return self.frames(state).site_position(self.robot.feet)[..., 2].clamp_min(0.0)
 
     def foot_contact(self, state: StepState) -> Contact:
@@ -198,7 +198,7 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         return AirTime.of(self.next_memory["air_time"])
 
     def landed(self) -> Tensor:
-        """1 for feet whose contact with the ground has begun in this step, else 0, (W, F)."""
+        """1 for feet that touched down in this step, else 0, (W, F)."""
         return self.air_time().first_contact(self.config.control_timestep).float()
 
     # Memory
@@ -231,8 +231,8 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     # Observation
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
-        if self._no_sensors:
-            raise ConfigError(self._no_sensors)
+        if self._sensor_error:
+            raise ConfigError(self._sensor_error)
         sensors = self.sensors(state)
         return torch.cat(
             (

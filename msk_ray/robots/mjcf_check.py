@@ -1,4 +1,4 @@
-"""What a robot's MJCF lacks or has wrong, said when its environment is made."""
+"""Checks that a robot's MJCF has what its environment needs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -8,16 +8,21 @@ from msk_ray.errors import ConfigError, shortened
 from msk_ray.robots.robot import Robot
 
 GROUND = "terrain"
-"""Body with the ground."""
-_TOLERANCE = 1e-4
-"""By which a keyframe, written in decimals, may be beyond a range [rad]."""
+"""Name of the body with the ground."""
+_ROUNDING = 1e-4
+"""Angle by which a keyframe may exceed a joint's range, because its decimals are rounded [rad]."""
 
 
 def check_default_pose(owner: str, model: mujoco.MjModel, qpos: Sequence[float] | None) -> None:
-    """Check the pose of the keyframe that a class's episodes begin with; None if it has no keyframe.
+    """Check the keyframe that episodes begin with.
+
+    Args:
+        owner: name of the environment's class, for messages.
+        model: its model.
+        qpos: pose of the keyframe, (nq,); None: the model has no keyframe.
 
     Raises:
-        ConfigError: there is none, or a joint is outside its range in it.
+        ConfigError: there is no keyframe, or it puts a joint outside its range.
     """
     if qpos is None:
         raise ConfigError(
@@ -28,7 +33,7 @@ def check_default_pose(owner: str, model: mujoco.MjModel, qpos: Sequence[float] 
         f"joint {model.joint(joint).name!r} is at {angle:.4g} rad, outside its range {low:.4g} to {high:.4g} rad"
         for joint, (low, high) in enumerate(model.jnt_range)
         if model.jnt_limited[joint]
-        and not low - _TOLERANCE <= (angle := qpos[model.jnt_qposadr[joint]]) <= high + _TOLERANCE
+        and not low - _ROUNDING <= (angle := qpos[model.jnt_qposadr[joint]]) <= high + _ROUNDING
     ]
     if outside:
         others = f", and so are {len(outside) - 1} others" if len(outside) > 1 else ""
@@ -39,7 +44,7 @@ def check_default_pose(owner: str, model: mujoco.MjModel, qpos: Sequence[float] 
 
 
 def missing_parts(robot: Robot, model: mujoco.MjModel) -> list[str]:
-    """The names of a robot that its model lacks, in one text for each kind of part."""
+    """Names in `robot` that its model lacks: one sentence for each kind of part that is missing."""
     ground, parts = {GROUND: "with the ground"}, dict.fromkeys(robot.foot_parts, "")
     bodies = dict.fromkeys((robot.base, robot.trunk), "") | ground
     kinds = {"body": bodies, "site": dict.fromkeys(robot.feet, "")}
@@ -51,7 +56,13 @@ def missing_parts(robot: Robot, model: mujoco.MjModel) -> list[str]:
 
 
 def missing(kind: str, names: Mapping[str, str], model: mujoco.MjModel) -> str | None:
-    """Which of some names, with a word on what each is, no part of a kind has in the model; None if all are there."""
+    """A sentence on the names that the model lacks; None if it has all.
+
+    Args:
+        kind: kind of the parts: body, site, geom or sensor.
+        names: names to look for, each with what it stands for, or "".
+        model: the model.
+    """
     known = _names(kind, model)
     lacking = [f"{name!r} ({what})" if what else repr(name) for name, what in names.items() if name not in known]
     if not lacking:
@@ -60,7 +71,7 @@ def missing(kind: str, names: Mapping[str, str], model: mujoco.MjModel) -> str |
 
 
 def _names(kind: str, model: mujoco.MjModel) -> list[str]:
-    """Names of all parts of a kind, in their order."""
+    """Names of the parts of a kind that have one, in the model's order."""
     count = {"body": model.nbody, "site": model.nsite, "geom": model.ngeom, "sensor": model.nsensor}[kind]
-    each: Iterable[str] = (getattr(model, kind)(i).name for i in range(count))
-    return list(filter(None, each))
+    names: Iterable[str] = (getattr(model, kind)(i).name for i in range(count))
+    return list(filter(None, names))

@@ -10,13 +10,14 @@ from msk_ray.errors import ConfigError
 
 @dataclass(frozen=True)
 class PoseSpread:
-    """Spread of joint angles about the default pose that the term `pose` tolerates [rad], by patterns of names."""
+    """Spread of joint angles about the default pose that the term `pose` tolerates [rad], by pattern of joint names."""
 
     standing: Mapping[str, float]
-    """Where the command is below 0.05 m/s plus rad/s."""
+    """For commanded speeds, in m/s plus rad/s, below 0.05."""
     walking: Mapping[str, float]
+    """For commanded speeds from 0.05 to 1.5."""
     running: Mapping[str, float]
-    """Where the command is 1.5 m/s plus rad/s or more."""
+    """For commanded speeds of 1.5 and more."""
 
 
 @dataclass(frozen=True)
@@ -26,18 +27,18 @@ class Robot:
     base: str
     """Body with the free joint."""
     trunk: str
-    """Body that is to stay upright."""
+    """Body that should stay upright."""
     feet: tuple[str, ...]
     """Sites under the feet, F of them."""
     foot_parts: tuple[str, ...]
-    """What of each foot touches the ground."""
+    """The part of each foot that touches the ground."""
     foot_kind: Literal["geom", "subtree"]
-    """Whether these are geoms or bodies."""
+    """What `foot_parts` names: geoms, or bodies that count with all bodies below them."""
     pose_spread: PoseSpread
 
 
 def by_joint(values: Mapping[str, float], joints: Sequence[str]) -> list[float]:
-    """The value of each joint: that of the one pattern which its whole name matches.
+    """The value for each joint, from the pattern that matches its whole name.
 
     Raises:
         ConfigError: no pattern matches a joint, or several do.

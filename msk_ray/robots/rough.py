@@ -18,25 +18,25 @@ from msk_ray.step.autograd.ground import grid
 from msk_ray.step.autograd.tangent import quat_rotate
 
 _COLLISION_FORCE = 10.0
-"""Force of a thigh on the ground with which an episode ends [N]."""
+"""Force on a thigh, shank, trunk or head from which it counts as hitting the ground [N]."""
 _REACH = 5.0
-"""Of the scan; its readings are divided by it [m]."""
+"""Reach of the scan; the observation divides its readings by it [m]."""
 _RING = 0.04
-"""Radius about a foot in which its height is taken above the highest ground [m]."""
+"""Radius around a foot within which the highest ground counts for the foot's height [m]."""
 _ABOVE = 1.0
-"""Height above a foot at which rays begin, so that they do not begin in the ground [m]."""
+"""Height above a foot at which rays begin, so that they do not begin inside the ground [m]."""
 _FITTED = 32
-"""Points of the scan to which the plane of the ground is fitted."""
+"""Number of scanned points to which a plane of the ground is fitted."""
 _ROUGHEST_PLANE = 0.1
-"""Variance across a fitted plane, as a share of that along it, from which the ground counts as level instead."""
+"""Variance across a fitted plane, as a share of the variance along it, from which the ground counts as level."""
 
 
 class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
     """mjlab's `Mjlab-Velocity-Rough-Unitree-Go1`: patches of stairs, slopes, noise and waves.
 
-    The observation ends with the height of the trunk above the ground at 11 × 17 points around it, over 5 m. Feet have
-    the height above the highest ground within 4 cm of them. Episodes begin in the middle of a patch and end when a
-    thigh touches the ground.
+    The observation ends with the scan: the height of the trunk above the ground at 11 × 17 points around it, divided by
+    5 m. The height of a foot is measured from the highest ground within 4 cm. Episodes begin in the middle of a patch
+    and end when a thigh hits the ground.
     """
 
     Settings = Go1VelocityRoughSettings
@@ -80,12 +80,12 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
     # What terms and observation use
 
     def hits(self, state: StepState, geoms: tuple[str, ...]) -> Tensor:
-        """Substeps in which a contact of these geoms with the ground has had more than 10 N, (W,)."""
+        """Number of substeps in which one of these geoms hit the ground with more than 10 N, (W,)."""
         strongest = self.contact(state, geoms, "geom", "terrain", "body").strongest
         return (strongest > _COLLISION_FORCE).any(-1).sum(0)
 
     def foot_heights(self, state: StepState) -> Tensor:
-        """Heights of the feet above the highest ground around them [m], (W, F); 0 below it."""
+        """Heights of the feet above the highest ground around them [m], at least 0, (W, F)."""
         frames, feet = self.frames(state), self.robot.feet
         position, orientation = frames.site_position(feet), frames.site_orientation(feet)
         axis = quat_rotate(orientation, self._ahead.expand_as(position))[..., :2]
@@ -104,7 +104,7 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
         """(Sine of the angle between the trunk's z axis and the normal of the ground around it)², (W,)."""
         up = self.frames(state).axis(self.robot.trunk, 2)
         ahead = torch.nn.functional.normalize(self.frames(state).axis(self.robot.trunk, 0)[:, :2], dim=-1)
-        # In axes that turn with the heading, as the scan does.
+        # `along` and `across` are components in axes that turn with the heading, as the scan's points do.
         along = (up[:, :2] * ahead).sum(-1)
         across = up[:, 1] * ahead[:, 0] - up[:, 0] * ahead[:, 1]
         height = -self.scan(state)[:, self._fitted]
@@ -121,11 +121,12 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
 
 
 def plane_normal(points: Tensor, up: Tensor) -> Tensor:
-    """Normal of the plane with the least squared distances from points (W, P, 3), (W, 3); `up` (3,) where they are far
+    """Unit normals (W, 3) of the planes fitted by least squares to points (W, P, 3); `up` (3,) where the points are far
     from any plane."""
     centred = points - points.mean(1, keepdim=True)
     covariance = centred.mT @ centred
-    # The normal has the smallest eigenvalue of three, so the largest one of the adjugate, which powers bring out.
+    # The normal is the eigenvector with the smallest eigenvalue, which is the adjugate's largest: taking powers of the
+    # adjugate leaves that eigenvector alone.
     rows = covariance.unbind(1)
     adjugate = torch.stack([torch.linalg.cross(rows[(k + 1) % 3], rows[(k + 2) % 3]) for k in range(3)], dim=1)
     power = adjugate

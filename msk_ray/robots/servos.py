@@ -1,6 +1,6 @@
 """Legged robots whose joints are turned by position servos, with mjlab's actions.
 
-Axes: W worlds, J joints but for the free one.
+Axes: W worlds, J joints except the free one.
 """
 
 from typing import ClassVar, Generic, TypeVar
@@ -23,16 +23,17 @@ from msk_ray.step.autograd.tangent import quat_conjugate, quat_rotate
 AnyServoSettings = TypeVar("AnyServoSettings", bound=ServoSettings)
 
 _TORQUE_SHARE = 0.25
-"""Share of a servo's largest torque with which it begins to turn to the target of mjlab's action 1."""
+"""Share of a servo's largest torque with which it starts towards the target of an mjlab action of 1."""
 _LIMIT_SHARE = 0.9
-"""Share of a joint's range, about its middle, beyond which the term `dof_pos_limits` counts."""
+"""Share of a joint's range, about its middle, outside which the term `dof_pos_limits` counts."""
 
 
 def servos_of(model: mujoco.MjModel) -> list[int]:
-    """The position servo of each joint after the first, which is free.
+    """Number of the position servo of each joint, J numbers in the order of the joints.
 
     Raises:
-        ConfigError: the first joint is not free, another is no hinge, or one has no position servo with a force range.
+        ConfigError: the first joint is not free, another is not a hinge, or a hinge has no position servo with a force
+            range.
     """
     kinds = [mujoco.mjtJoint(kind) for kind in model.jnt_type]
     if kinds[:1] != [mujoco.mjtJoint.mjJNT_FREE] or any(kind != mujoco.mjtJoint.mjJNT_HINGE for kind in kinds[1:]):
@@ -52,7 +53,11 @@ def servos_of(model: mujoco.MjModel) -> list[int]:
 
 
 def action_scale_of(model: mujoco.MjModel) -> NDArray[np.float64]:
-    """Angle of each joint for mjlab's action 1 [rad], (J,)."""
+    """Angle by which an mjlab action of 1 moves the target of each joint [rad], (J,).
+
+    Raises:
+        ConfigError: as for `servos_of`.
+    """
     servos = servos_of(model)
     scale: NDArray[np.float64] = (
         _TORQUE_SHARE * model.actuator_forcerange[servos, 1] / model.actuator_gainprm[servos, 0]
@@ -99,7 +104,7 @@ class ServoEnv(MjcfEnv[AnyServoSettings], Generic[AnyServoSettings]):
         return quat_rotate(quat_conjugate(orientation), self._down.expand(self.nworld, 3))
 
     def mjlab_action(self, action: Tensor) -> Tensor:
-        """mjlab's action for one of the policy, both (W, J)."""
+        """A policy's action in mjlab's units, both (W, J)."""
         return self.config.action_range * action
 
     def control(self, action: Tensor) -> Tensor:

@@ -1,7 +1,9 @@
 """The reward terms of the velocity tasks, under mjlab's names, for classes derived from `VelocityEnv`.
 
-Each gives a value (W,) for the `state` that a step has led to, observed as `obs`, by `action`. The command is that of
-the state in which the step began. Source: `tasks/velocity/mdp/rewards.py` and `envs/mdp/rewards.py` of mjlab 1.6.0.
+Each gives a value (W,) for the `state` that a step by `action` led to, with its observation `obs`. The command is the
+one of the state in which the step began.
+
+Source: `tasks/velocity/mdp/rewards.py` and `envs/mdp/rewards.py` of mjlab 1.6.0.
 
 Axes: W worlds, J joints, F feet.
 """
@@ -21,19 +23,19 @@ if TYPE_CHECKING:
 Robots = VelocityEnv[Any]
 
 _SWING_HEIGHT = 0.1
-"""Height that feet should have in swing [m]."""
+"""Height that a foot should reach in swing [m]."""
 _HEIGHT_SPREAD = 0.1
-"""Distance from the default height at which `base_height` is e^−1 [m]."""
+"""Difference from the default height at which `base_height` is e^−1 [m]."""
 _AIR_TIME = 0.05, 0.5
-"""Range of the time in the air that `air_time` rewards [s]."""
-_AIR_TIME_COMMAND = 0.5
-"""Command from which it does, in m/s plus rad/s."""
+"""Shortest and longest time in the air that `air_time` rewards [s]."""
+_AIR_TIME_SPEED = 0.5
+"""Commanded speed above which `air_time` rewards anything, in m/s plus rad/s."""
 _COLLISION_FORCE = 10.0
-"""Force from which a collision counts [N]."""
+"""Force above which a collision counts [N]."""
 
 
 def closeness(relative: Tensor, tail: float) -> Tensor:
-    """e^−x, and for `tail` > 0, in training, a share of 1/(1 + x)."""
+    """e^−x, or with a `tail` > 0, as in training, a mixture with that share of 1/(1 + x)."""
     close = torch.exp(-relative)
     return close if tail == 0.0 else torch.lerp(close, 1.0 / (1.0 + relative), tail)
 
@@ -65,7 +67,7 @@ def upright(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tenso
 
 
 def upright_on_ground(env: "Go1VelocityRough", state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """exp(−s² / 0.2), where s is the sine of the trunk's tilt to the ground around it."""
+    """exp(−s² / 0.2), where s is the sine of the angle between the trunk and the normal of the ground around it."""
     return closeness(env.tilt_to_ground(state) / 0.2, env.config.reward.pose_tail)
 
 
@@ -81,7 +83,7 @@ def variable_posture(env: Robots, state: StepState, action: Tensor, obs: Tensor)
 def base_height(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
     """exp(−(height of the base − its default)² / (0.1 m)²). Not in mjlab: a slope out of a crouch, for training.
 
-    `env.reward.pose_tail` gives it one far from the default height as well.
+    `env.reward.pose_tail` gives it a slope far from the default height as well.
     """
     distance = (env.base_height(state) - env.default_height) / _HEIGHT_SPREAD
     return closeness(distance.square(), env.config.reward.pose_tail)
@@ -113,25 +115,30 @@ def air_time(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tens
     """Number of feet that have been in the air for 0.05 to 0.5 s. No slope."""
     time, (shortest, longest) = env.air_time().air, _AIR_TIME
     flying = ((time > shortest) & (time < longest)).sum(-1)
-    return flying.float() * (env.commanded_speed() > _AIR_TIME_COMMAND)
+    return flying.float() * (env.commanded_speed() > _AIR_TIME_SPEED)
 
 
 def foot_clearance(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """Sum over the feet of |height − 0.1 m| × horizontal speed [m²/s], with the height at the start of the step, as in
-    mjlab, which measures heights once a step."""
+    """Sum over the feet of |height − 0.1 m| × horizontal speed [m²/s].
+
+    The height is the one at the start of the step, as in mjlab, which measures heights once a step.
+    """
     distance = (env.memory["foot_height"] - _SWING_HEIGHT).abs()
     return (distance * _foot_speed(env, state)).sum(-1) * env.is_commanded()
 
 
 def foot_swing_height(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """Sum over the feet that land of (largest height in the swing / 0.1 m − 1)². Its slope reaches the step of that
-    height if it is within the horizon; landing has none."""
+    """Sum over the feet that land of (largest height in the swing / 0.1 m − 1)².
+
+    It has a slope with respect to the state of the largest height, if that is within the horizon, but none with respect
+    to landing.
+    """
     error = env.memory["peak_height"] / _SWING_HEIGHT - 1.0
     return (error.square() * env.landed()).sum(-1) * env.is_commanded()
 
 
 def foot_slip(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """Sum over the feet on the ground of (horizontal speed)² [m²/s²]; whether they are there has no slope."""
+    """Sum over the feet on the ground of (horizontal speed)² [m²/s²]. Whether a foot is on the ground has no slope."""
     on_ground = (env.air_time().contact > 0.0).float()
     return (_foot_speed(env, state).square() * on_ground).sum(-1) * env.is_commanded()
 
@@ -143,9 +150,9 @@ def soft_landing(env: Robots, state: StepState, action: Tensor, obs: Tensor) -> 
 
 
 def self_collisions(env: ServoEnv[Any], state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """Number of substeps in which a contact between parts of the robot has more than 10 N. No slope.
+    """Number of substeps in which parts of the robot press on each other with more than 10 N. No slope.
 
-    mjlab looks at one contact of a substep, whichever comes first; this at the strongest.
+    Of the contacts in a substep, mjlab looks at the one that comes first; this term looks at the strongest.
     """
     contact = env.contact(state, env.robot.base, "subtree", env.robot.base, "subtree")
     return (contact.strongest[..., 0] > _COLLISION_FORCE).sum(0).float()

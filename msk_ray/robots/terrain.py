@@ -13,32 +13,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SIDE = 8.0
-"""Of a patch."""
+"""Side of a patch."""
 _BORDER = 40.0
 """Width of the flat ground around all patches, which no robot crosses in an episode."""
 _DEPTH = 1.0
-"""Thickness of the ground: nothing slips between its parts."""
+"""Thickness of the ground, so that nothing slips through between its parts."""
 _STAIRS, _STEP, _PLATFORM = 6.0, 0.3, 3.0
-"""Sides of stairs and of their platform, and the depth of a step."""
+"""Side of the stairs, depth of a step, and side of the platform."""
 _HIGHEST_STEP = 0.1
+"""Height of a step in the hardest row."""
 _CELLS = 80
 """Points of a height field along each side."""
 _EDGE = 2
-"""Points at its edges that are level."""
+"""Points at each edge of a height field that are level."""
 _SPACING = 0.1
+"""Distance between the points of a height field."""
 _UNIT = 0.005
 """Heights of height fields are whole multiples of it."""
 _SLOPE = 1.0
 """Steepest slope, rise over run, towards a platform of 2 m."""
 _NOISE = (0.02, 0.10)
+"""Smallest and largest random height."""
 _NOISE_STEP = 0.02
+"""Random heights are multiples of it."""
 _WAVE = 0.2
-"""Highest wave."""
+"""Height of the waves in the hardest row, from trough to crest along one axis."""
 _WAVES = 4
+"""Number of waves along each axis."""
 _FOOTPRINT = 8
-"""Points from the middle of a patch within which a robot that begins there stands."""
+"""Points from the middle of a patch within which a robot stands that begins there."""
 _SEED = 0
-"""Of the heights that are random."""
+"""Seed of the random heights."""
 
 
 class Box(NamedTuple):
@@ -55,10 +60,10 @@ class Patch(NamedTuple):
     """What a patch is made of, around its middle."""
 
     start: float
-    """Height at which robots begin."""
+    """Height of the ground on which robots begin."""
     boxes: tuple[Box, ...] = ()
     heights: NDArray[np.float64] | None = None
-    """Of a height field, rows along y."""
+    """Heights of the points of a height field, (rows along y, columns along x); None: boxes alone."""
 
 
 Generate = Callable[[float, np.random.Generator], Patch]
@@ -75,7 +80,7 @@ def stairs_up(difficulty: float, rng: np.random.Generator) -> Patch:
 
 
 def stairs_down(difficulty: float, rng: np.random.Generator) -> Patch:
-    """The same upside down: robots begin at the bottom."""
+    """The stairs upside down: robots begin at the bottom."""
     return _stairs(-difficulty * _HIGHEST_STEP)
 
 
@@ -85,7 +90,7 @@ def slope_up(difficulty: float, rng: np.random.Generator) -> Patch:
 
 
 def slope_down(difficulty: float, rng: np.random.Generator) -> Patch:
-    """The same upside down."""
+    """The slopes upside down: robots begin at the bottom."""
     return _slope(-difficulty * _SLOPE)
 
 
@@ -115,7 +120,7 @@ KINDS: Final[dict[Generate, float]] = {
 
 
 class Terrain:
-    """R × K patches around the origin: x goes from easy to hard, y from kind to kind.
+    """R × K patches around the origin: they get harder along x, and along y the kind changes.
 
     Args:
         rows: number of rows R, at least 2.
@@ -137,7 +142,7 @@ class Terrain:
                 self.starts[row, column] = *middle, patch.start
 
     def add_to(self, spec: mujoco.MjSpec, body: str) -> None:
-        """Make the patches the geoms of a body of the model, in place of those that it has."""
+        """Replace the geoms of a body of the model by the patches."""
         ground = spec.body(body)
         for geom in list(ground.geoms):
             spec.delete(geom)
@@ -166,7 +171,11 @@ class Terrain:
 
 
 def _ring(outer: NDArray[np.float64], inner: NDArray[np.float64]) -> Iterator[tuple[float, float, float, float]]:
-    """Four rectangles between two of these sides (2,), each as centre and half sides."""
+    """Four rectangles that fill the space between two concentric ones, each as its centre and half sides.
+
+    Args:
+        outer, inner: sides of the concentric rectangles along x and y, (2,).
+    """
     (width, height), (thick_x, thick_y) = outer / 2.0, (outer - inner) / 4.0
     for side in (1.0, -1.0):
         yield 0.0, side * (height - thick_y), width, thick_y
@@ -198,7 +207,7 @@ def _slope(slope: float) -> Patch:
 
 
 def _field(units: NDArray[np.floating]) -> Patch:
-    """A height field with a level edge."""
+    """A height field with a level edge, from heights in multiples of 5 mm."""
     heights = np.pad(np.rint(units) * _UNIT, _EDGE)
     near = slice(_CELLS // 2 - _FOOTPRINT, _CELLS // 2 + _FOOTPRINT)
     return Patch(float(heights[near, near].max()), heights=heights)

@@ -76,7 +76,7 @@ def folder(page: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     sys.modules.pop("my_robot", None)
 
 
-def test_its_commands_and_programs_run(
+def test_commands_and_programs_of_the_page_run(
     page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":0")
@@ -104,9 +104,7 @@ def test_its_commands_and_programs_run(
     _compare_observation(follow)
 
 
-def test_the_go1_of_the_package_goes_where_the_page_says(
-    page: Path, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_shipped_go1_ends_where_the_page_says(page: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert commands.main(["export", "go1_velocity", "--onnx", "my_robot.onnx"]) == 0
     program = Path("follow.py").read_text()
     Path("follow.py").write_text(program.replace("((gyro,", '((data.sensor("imu_lin_vel").data, gyro,'))
@@ -118,7 +116,7 @@ def test_the_go1_of_the_package_goes_where_the_page_says(
     assert [float(x) for x in said.groups()] == pytest.approx([float(x) for x in expected.groups()], abs=0.2)
 
 
-def test_its_history_holds_what_the_policy_was_given(folder: Path) -> None:
+def test_the_history_of_the_page_holds_what_the_policy_was_given(folder: Path) -> None:
     config = load_config("my_robot.yaml")
     assert config.physics.randomize is not None
     env = make_env(config.env, config.physics, 4, "cpu", 0, differentiable=False, randomize=True)

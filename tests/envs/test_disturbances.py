@@ -34,7 +34,7 @@ def clean(env: Env[Any]) -> Tensor:
     return env.observe(env.state.physics, env.state.action)
 
 
-def test_noise_is_that_of_its_distribution_and_the_same_for_as_often_as_it_is_asked() -> None:
+def test_noise_follows_its_distribution_and_is_the_same_each_time_a_state_is_observed() -> None:
     env = cartpole(512, observation_noise=DISTURBANCES["observation_noise"])
     noise = []
     for _ in range(20):
@@ -62,7 +62,7 @@ def test_the_critic_sees_the_undisturbed_observation() -> None:
     assert not cartpole(push=DISTURBANCES["push"]).asymmetric
 
 
-def test_a_hash_has_every_value_once_in_a_while() -> None:
+def test_hashes_are_uniform_and_rarely_repeat() -> None:
     drawn = uniform_hash(torch.linspace(0.0, 1.0, 101)[:-1], torch.arange(100), 1000)
     assert torch.histc(drawn, 10, 0.0, 1.0).tolist() == pytest.approx([1e4] * 10, rel=0.03)
     assert float(drawn.min()) >= 0.0
@@ -70,7 +70,7 @@ def test_a_hash_has_every_value_once_in_a_while() -> None:
     assert len(drawn.unique()) > 0.99 * drawn.numel()
 
 
-def test_a_bias_stays_for_an_episode_and_rewards_are_of_the_clean_observation() -> None:
+def test_a_bias_stays_for_an_episode_and_rewards_use_the_clean_observation() -> None:
     env, plain = cartpole(length=5, observation_bias={"cart_position": {"uniform": 0.1}}), cartpole(length=5)
     seen = []
     for _ in range(10):
@@ -131,7 +131,7 @@ def test_servos_follow_the_bias_of_their_encoders() -> None:
     assert (biases[0] - biases[5]).abs().min() > 1e-5
 
 
-def test_a_late_observation_is_that_of_an_earlier_step_with_its_noise() -> None:
+def test_a_late_observation_keeps_the_noise_of_its_own_step() -> None:
     noise = {"cart_position": {"uniform": 0.1}}
     late, prompt = cartpole(observation_noise=noise, observation_delay=[2, 2]), cartpole(observation_noise=noise)
     late.state = late.state._replace(numbers=torch.cat((prompt.state.numbers, late.state.numbers[:, 1:]), dim=1))
@@ -146,7 +146,7 @@ def test_a_late_observation_is_that_of_an_earlier_step_with_its_noise() -> None:
         assert torch.equal(obs, late.observation())
 
 
-def test_each_episode_has_a_delay_of_its_own_even_where_ages_are_spread() -> None:
+def test_each_episode_draws_its_own_delay_even_if_ages_are_spread() -> None:
     env = cartpole(length=10, observation_delay=[0, 2])
     env.spread_ages()
     past, delays = [clean(env)], []
@@ -179,7 +179,7 @@ def test_a_history_holds_what_the_policy_was_given_then(delay: list[int]) -> Non
     assert (given[-1] - clean(env)[:, :5]).abs().amin() > 0.0
 
 
-def test_one_sensor_has_one_bias_in_all_frames_and_scores_have_none() -> None:
+def test_a_sensor_has_the_same_bias_in_all_frames_and_none_in_scores() -> None:
     env, plain = recalling(observation_bias={"*": {"uniform": 0.1}}), recalling()
     for _ in range(3):
         env.step(torch.zeros(W, 1))
@@ -217,7 +217,7 @@ def test_late_controls_act_later_with_their_gradient() -> None:
     assert not (torch.zeros(1) if gradients[0][4] is None else gradients[0][4]).any()
 
 
-def test_the_gradient_goes_through_errors_and_late_observations_as_through_clean_ones() -> None:
+def test_gradients_flow_through_errors_and_late_observations() -> None:
     env = cartpole(observation_delay=[1, 1], observation_noise=DISTURBANCES["observation_noise"])
     first, second = (torch.zeros(W, 1, requires_grad=True) for _ in range(2))
     env.step(first)
@@ -228,7 +228,7 @@ def test_the_gradient_goes_through_errors_and_late_observations_as_through_clean
     assert to_second is None or not to_second.any()
 
 
-def test_kicks_come_in_their_time_and_size() -> None:
+def test_kicks_have_the_configured_times_and_sizes() -> None:
     kicked, plain = (cartpole(256, push=p) if p else cartpole(256) for p in (DISTURBANCES["push"], None))
     sizes, steps = [], []
     for step in range(39):
@@ -251,7 +251,7 @@ def test_kicks_come_in_their_time_and_size() -> None:
     assert float(torch.stack(steps).float().mean()) == pytest.approx(1.0 / 3.6, rel=0.1)
 
 
-def test_initial_states_and_parameters_are_those_without_disturbances() -> None:
+def test_disturbances_leave_initial_states_and_parameters_unchanged() -> None:
     mass = {"body_mass": {"low": 0.5, "high": 2.0}}
     both, alone = cartpole(**DISTURBANCES, **mass), cartpole(**mass)
     assert torch.equal(both.state.physics.qpos, alone.state.physics.qpos)
@@ -266,7 +266,7 @@ def config(tiny_settings: dict[str, Any]) -> Config:
     return parse_config(overlay(tiny_settings, {"physics.randomize": DISTURBANCES, "env.episode_length": 4}))
 
 
-def test_scores_are_to_the_bit_those_without(config: Config) -> None:
+def test_scores_are_bitwise_the_same_with_and_without_disturbances(config: Config) -> None:
     plain = config.model_copy(update={"physics": PhysicsConfig()})
     policy = lambda obs: obs[:, :1].tanh()  # noqa: E731
     ours, without = (Evaluator(c, "cpu").episodes(policy).score for c in (config, plain))
@@ -276,7 +276,7 @@ def test_scores_are_to_the_bit_those_without(config: Config) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("algorithm", ["shac", "ppo"])
-def test_a_resumed_trial_is_the_same_to_the_bit(config: Config, tmp_path: Path, algorithm: str) -> None:
+def test_a_resumed_trial_is_bitwise_the_same(config: Config, tmp_path: Path, algorithm: str) -> None:
     settings = config.as_dict()
     if algorithm == "ppo":
         del settings["shac"]
@@ -305,7 +305,7 @@ class Half(Group):
         return values.chunk(2, dim)[self.rank]
 
 
-def test_the_processes_of_a_group_have_the_disturbances_of_one() -> None:
+def test_several_processes_draw_the_same_disturbances_as_one() -> None:
     whole = cartpole(8, **DISTURBANCES)
     for rank in range(2):
         half, group = cartpole(4, **DISTURBANCES), Half()
@@ -339,7 +339,7 @@ class Twofold(CartPole):
         return [Entry(f"{entry.name}_{'of_a_joint_' * 10}", "") for entry in super().observation_layout()] * 2
 
 
-def test_names_that_no_pattern_means_are_listed_once_and_not_all() -> None:
+def test_an_unknown_name_lists_each_known_name_once_and_not_too_many() -> None:
     trial = parse_config({"env": {"name": f"{__name__}:Twofold"}})
     physics = PhysicsConfig.model_validate({"randomize": {"observation_noise": {"hip": {"uniform": 0.1}}}})
     with pytest.raises(ConfigError, match="no entry of the observation is 'hip'; it has cart_position") as refused:
@@ -387,13 +387,13 @@ def cartpole_trial(randomize: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_makes_no_sense_is_refused(name: str) -> None:
+def test_a_senseless_section_is_refused(name: str) -> None:
     section, why = REFUSED[name]
     with pytest.raises(ConfigError, match=why):
         cartpole_trial(section)
 
 
-def test_entries_without_names_cannot_be_disturbed() -> None:
+def test_an_observation_without_named_entries_cannot_be_disturbed() -> None:
     trial = parse_config(
         {"env": {"name": f"{__name__}:Unnamed"}, "physics": {"randomize": {"observation_delay": [1, 1]}}}
     )

@@ -74,7 +74,7 @@ def rods(nworld: int = 256, **env: Any) -> Env[Any]:
     return make_env(config.env, config.physics, nworld, "cpu", 0)
 
 
-def test_they_are_drawn_again_within_an_episode_after_the_times_asked_for() -> None:
+def test_commands_are_drawn_again_within_an_episode_after_the_configured_times() -> None:
     """Every 2 to 4 of 20 steps; the last draw may be any time old."""
     env = rods()
     paces, ways = [env.command("pace")], [env.command("way")]
@@ -98,20 +98,20 @@ def test_they_are_drawn_again_within_an_episode_after_the_times_asked_for() -> N
     assert 2.0 <= way.min() < 2.1 < 3.9 < way.max() <= 4.0
 
 
-def test_the_numbers_of_a_start_are_beside_them() -> None:
+def test_numbers_of_an_episode_are_stored_beside_commands() -> None:
     env = rods()
     task = env.task_numbers(env.state.numbers)
     assert task.shape == (256, 1)
     assert bool(((task >= 6.0) & (task < 8.0)).all())
 
 
-def test_without_random_starts_they_are_in_the_middle() -> None:
+def test_without_random_starts_commands_are_in_the_middle_of_their_ranges() -> None:
     env = rods(nworld=2, stochastic_reset=False)
     assert env.command("pace").tolist() == [[1.0, 0.5]] * 2
     assert env.command("way").tolist() == [[3.0]] * 2
 
 
-def test_ranges_are_settings_and_scores_are_taken_with_those_of_the_class() -> None:
+def test_ranges_are_settings_and_scores_use_the_ranges_of_the_class() -> None:
     ranges = {"pace": {"rate": [5.0, 6.0], "every": [0.2, 0.2]}}
     env = rods(commands=ranges)
     assert bool(((env.command("pace")[:, 0] >= 5.0) & (env.command("pace")[:, 0] <= 6.0)).all())
@@ -140,7 +140,7 @@ def test_wrong_settings_are_refused(settings: Any, message: str) -> None:
         trial(commands=settings)
 
 
-def test_wrong_declarations_are_refused() -> None:
+def test_wrong_declarations_of_commands_are_refused() -> None:
     with pytest.raises(ValueError, match="command 'pace' needs ranges by name"):
         Command("pace", {})
     with pytest.raises(ValueError, match="none of them named 'every'"):
@@ -151,7 +151,7 @@ def test_wrong_declarations_are_refused() -> None:
         rods(nworld=1).command("speed")
 
 
-def test_a_curriculum_widens_them_and_a_checkpoint_keeps_them(tmp_path: Path) -> None:
+def test_a_curriculum_widens_ranges_and_a_checkpoint_keeps_them(tmp_path: Path) -> None:
     first, second = (Trainer(trial("Widening"), tmp_path / name, "cpu") for name in "ab")
     first.run_epoch()
     first.run_epoch()

@@ -89,7 +89,7 @@ def rod(name: str = "Rod") -> Env[Any]:
     return make_env(config.env, config.physics, 4, "cpu", 0)
 
 
-def test_worlds_remember_until_their_episode_ends_and_a_step_observes_what_the_next_one_begins_with() -> None:
+def test_memory_lasts_until_the_episode_ends_and_observations_show_the_new_memory() -> None:
     env = rod()
     env.spread_ages()
     every = []
@@ -111,7 +111,7 @@ def test_worlds_remember_until_their_episode_ends_and_a_step_observes_what_the_n
 @pytest.mark.parametrize(
     ("name", "slope"), [("Rod", (1.0 - INERTIA) * (INERTIA + 0.1 * (INERTIA - 1.0))), ("Detached", 0.0)]
 )
-def test_its_gradient_crosses_steps_if_that_is_declared(name: str, slope: float) -> None:
+def test_gradients_flow_through_memory_between_steps_only_if_declared(name: str, slope: float) -> None:
     """Within a step it always has one: the reward depends on the action through the memory alone."""
     env = rod(name)
     first, second = (torch.zeros(4, 1, requires_grad=True) for _ in range(2))
@@ -122,13 +122,13 @@ def test_its_gradient_crosses_steps_if_that_is_declared(name: str, slope: float)
     assert (0.0 if to_first is None else to_first) == pytest.approx(torch.full((4, 1), slope) if slope else 0.0)
 
 
-def test_the_gradient_of_a_policy_is_that_of_differences() -> None:
+def test_the_gradient_of_a_policy_with_memory_matches_finite_differences() -> None:
     (quality,) = probe(Subject(trial(), None), [None], ["reset"], [4], worlds=1, directions=2, seed=0, device="cpu")
     assert quality.cosine == pytest.approx(1.0, abs=1e-4)
     assert quality.norm_ratio == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_checkpoint_continues_with_it(tmp_path: Path) -> None:
+def test_a_checkpoint_restores_memory(tmp_path: Path) -> None:
     first, second = (Trainer(trial(), tmp_path / name, "cpu") for name in "ab")
     first.run_epoch()
     saved = copy.deepcopy(first.algorithm.state_dict())
@@ -166,7 +166,7 @@ class Second(Group):
         return [value, value]
 
 
-def test_in_a_group_a_checkpoint_has_that_of_all_worlds() -> None:
+def test_a_checkpoint_of_a_group_has_the_memory_of_all_worlds() -> None:
     env = rod()
     env.join(Second())
     env.step(torch.linspace(-1.0, 1.0, 4)[:, None])
@@ -177,7 +177,7 @@ def test_in_a_group_a_checkpoint_has_that_of_all_worlds() -> None:
     assert all(torch.equal(env.memory[name], values.detach()) for name, values in memory.items())
 
 
-def test_recordings_read_and_write_it() -> None:
+def test_recorded_epochs_read_and_write_memory() -> None:
     """The inputs of a recorded epoch are copies of everything that a rollout begins with."""
     env = rod()
     inputs = EpochInputs(env.state.detach(), env.starts.draw_steps(2, env.group), torch.zeros(2, 4, 1))
@@ -200,7 +200,7 @@ def test_an_evaluation_begins_with_start_values_and_scores_its_outcomes() -> Non
     assert evaluator.run([lambda obs: torch.ones(len(obs), 1)])[0] == one
 
 
-def test_an_environment_without_it_keeps_nothing() -> None:
+def test_an_environment_without_memories_keeps_nothing() -> None:
     config = parse_config({"env": {"name": "cartpole", "nworld": 2}})
     env = make_env(config.env, config.physics, 2, "cpu", 0)
     env.step(torch.zeros(2, 1))

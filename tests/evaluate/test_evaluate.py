@@ -38,7 +38,7 @@ def entries(folder: Path) -> list[dict[str, Any]]:
     return read_evaluations(folder / "eval.json")
 
 
-def test_the_score_is_the_one_trials_are_ranked_by_and_the_same_twice(trial: Path) -> None:
+def test_evaluation_repeats_the_score_that_ranks_trials(trial: Path) -> None:
     assert run(main, [str(trial), "--device", "cpu"]) == 0
     (first,) = entries(trial)
     assert run(main, [str(trial / "checkpoints" / "best.pt"), "--device", "cpu"]) == 0
@@ -89,7 +89,7 @@ def test_a_trial_without_disturbances_or_conditions_is_not_scored_under_any(
     assert not (trial / "eval.json").exists()
 
 
-def test_seeds_worlds_and_steps(trial: Path) -> None:
+def test_seeds_worlds_and_steps_can_be_chosen(trial: Path) -> None:
     assert run(main, [str(trial), "--seeds", "1,2", "--worlds", "3", "--steps", "10", "--device", "cpu"]) == 0
     (entry,) = entries(trial)
     assert not entry["canonical"]
@@ -138,7 +138,7 @@ def test_an_experiment_is_ranked_and_a_torn_policy_is_named(
     assert shown.count("(half the worlds: 8 of 16)") == 1
 
 
-def test_other_values_of_a_parameter(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_vary_evaluates_other_values_of_a_parameter(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = ["--steps", "20", "--device", "cpu"]
     assert run(main, [str(trial), "--vary", "jnt_stiffness=2x", *short]) == 2
     assert entries(trial) == [], "refused before anything is run"
@@ -175,7 +175,7 @@ def test_an_experiment_is_ranked_under_each_value(
     assert all(len(ranking["ranking"]) == 4 for ranking in rankings)
 
 
-def test_physics_by_name(ant_trial: Path) -> None:
+def test_physics_can_be_named(ant_trial: Path) -> None:
     policy = load_policy(ant_trial / "checkpoints" / "best.pt")
     bench = Bench("cpu")
     reference, published, own = (
@@ -197,7 +197,7 @@ def test_trials_share_a_simulation_unless_one_adds_up_in_a_fixed_order(tiny_sett
     assert ordered.env.sim.batch.ordered
 
 
-def test_figures_by_hand() -> None:
+def test_figures_match_those_worked_out_by_hand() -> None:
     flags = torch.tensor([True, False])
     run_a = Episodes(
         score=torch.tensor([1.0, 3.0]),
@@ -220,7 +220,7 @@ def test_figures_by_hand() -> None:
     assert (results["outcomes"]["vx"]["min"], results["outcomes"]["vx"]["max"]) == (1.0, 2.0)
 
 
-def test_policies_along_the_way_are_those_that_were_evaluated(trial: Path) -> None:
+def test_stored_policies_score_as_they_did_in_training(trial: Path) -> None:
     rows = {row["epoch"]: row for row in read_metrics(trial / "metrics.jsonl")}
     kept = milestones(trial / "checkpoints")
     assert [epoch for epoch, _ in kept] == [0, 2, 4, 6]
@@ -262,7 +262,7 @@ def test_counts_are_whole_numbers_that_devices_have(text: str) -> None:
         (["small/trials/nothing"], "give a .pt file"),
     ],
 )
-def test_bad_input_is_one_line(
+def test_bad_input_is_refused_in_one_line(
     sweep: Experiment, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     storage = ["--storage", str(sweep.path.parent)]

@@ -116,7 +116,9 @@ def entries(folder: Path) -> list[dict[str, Any]]:
     return read_evaluations(folder / "eval.json")
 
 
-def test_every_figure_by_hand(trial: Path, stand_in: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_figures_match_those_worked_out_by_hand(
+    trial: Path, stand_in: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     options = ["--in", "mjlab", "--python", str(stand_in), "--worlds", "2", "--seeds", "0,1", "--steps", "5"]
     assert run(main, [str(trial), *options]) == 0, capsys.readouterr()
     play, pushed = entries(trial)
@@ -135,7 +137,7 @@ def test_every_figure_by_hand(trial: Path, stand_in: Path, capsys: pytest.Captur
     assert "under mjlab pushed physics: 2 worlds, seeds 0,1, 5 steps, on cpu" in capsys.readouterr().out
 
 
-def test_what_cannot_be_evaluated_there_is_one_line(
+def test_what_mjlab_cannot_evaluate_is_refused_in_one_line(
     trial: Path, stand_in: Path, myoleg26_checkpoint: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (trial / "eval.json").unlink(missing_ok=True)
@@ -198,7 +200,7 @@ def _own_python(root: Path) -> Path:
     return python
 
 
-def test_in_mjlab_itself(trial: Path, root: Path) -> None:
+def test_a_policy_is_scored_in_the_real_mjlab(trial: Path, root: Path) -> None:
     python = _own_python(root)
     few = ["--worlds", "2", "--steps", "5"]
     assert run(main, [str(trial), "--in", "mjlab", "--python", str(python), *few]) == 0
@@ -208,7 +210,7 @@ def test_in_mjlab_itself(trial: Path, root: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_is_recorded_from_mjlab_is_what_it_gives(root: Path, tmp_path: Path) -> None:
+def test_recorded_fixtures_match_the_real_mjlab(root: Path, tmp_path: Path) -> None:
     python, fixtures = _own_python(root), root / "tests" / "fixtures" / "mjlab"
     subprocess.run([str(python), str(fixtures / "record.py"), str(tmp_path), str(tmp_path)], check=True)
     motion = tmp_path / "squat.npz"

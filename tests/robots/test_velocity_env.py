@@ -56,7 +56,7 @@ def test_starts_and_commands_are_drawn_as_mjlab_draws_them() -> None:
     assert (yaw > 0).float().mean() == pytest.approx(0.5, abs=0.05)
 
 
-def test_commands_are_those_of_mjlab() -> None:
+def test_commands_have_mjlabs_ranges_and_shares() -> None:
     env = make(4000)
     command = env.velocity_command()
     standing = (command == 0.0).all(-1)
@@ -68,7 +68,7 @@ def test_commands_are_those_of_mjlab() -> None:
     assert command.amax(0).tolist() == pytest.approx([2.0, 1.0, 0.7], abs=0.02)
 
 
-def test_a_heading_is_turned_to_the_shorter_way_round() -> None:
+def test_the_commanded_yaw_rate_turns_to_a_heading_the_shorter_way_round() -> None:
     north, never, always = math.pi / 2.0, [1.0, 1.0], [0.0, 0.0]
     kinds = {"stand": never, "go_ahead": never, "turn_to_heading": always, "heading": [north, north]}
     env = make(3, commands={"velocity": kinds})
@@ -80,7 +80,7 @@ def test_a_heading_is_turned_to_the_shorter_way_round() -> None:
     assert not make(3, commands={"velocity": kinds}).velocity_command().any()
 
 
-def test_standing_still_on_the_spot_is_what_a_zero_action_does() -> None:
+def test_a_zero_action_stands_still() -> None:
     env = make(2, commands={"velocity": {"stand": (0.0, 0.0)}})
     for _ in range(25):
         step = env.step(torch.zeros(2, 12))
@@ -92,7 +92,7 @@ def test_standing_still_on_the_spot_is_what_a_zero_action_does() -> None:
     assert not times.air.any()
 
 
-def test_a_tail_is_part_of_training_alone() -> None:
+def test_a_tail_gives_tracking_terms_a_slope_in_training_but_not_in_scores() -> None:
     far = {"commands": {"velocity": {"stand": (1.0, 1.0), "lin_vel_x": (2.0, 2.0)}}}
     plain, tailed = make(1, **far), make(1, reward={"tail": 0.5}, **far)
     still, close = (env.step(torch.zeros(1, 12)).terms[0, 0].item() for env in (plain, tailed))
@@ -101,7 +101,7 @@ def test_a_tail_is_part_of_training_alone() -> None:
     assert type(tailed).reference_settings(tailed.config).reward.tail == 0.0
 
 
-def test_a_tail_of_the_pose_gives_it_a_slope_far_away() -> None:
+def test_a_pose_tail_gives_pose_terms_a_slope_in_training_but_not_in_scores() -> None:
     """Every joint is three spreads away, the trunk lies on its side: x is 9, and 1 / 0.2."""
     plain, tailed = make(1), make(1, reward={"pose_tail": 0.25})
     for env, share in ((plain, 0.0), (tailed, 0.25)):
@@ -115,7 +115,7 @@ def test_a_tail_of_the_pose_gives_it_a_slope_far_away() -> None:
     assert type(tailed).reference_settings(tailed.config).reward.pose_tail == 0.0
 
 
-def test_costs_rise_in_training_alone() -> None:
+def test_costs_rise_in_training_but_not_in_scores() -> None:
     schedule = CostSchedule(start=0.1, begin=500, end=900)
     assert [schedule.at(epoch) for epoch in (0, 500, 700, 900, 2000)] == pytest.approx([0.1, 0.1, 0.55, 1.0, 1.0])
     env = make(1, cost_schedule=schedule)
@@ -127,7 +127,7 @@ def test_costs_rise_in_training_alone() -> None:
     assert env.weighted_terms.shares.tolist() == pytest.approx([0.1 if cost else 1.0 for cost in costs])
 
 
-def test_commands_widen_in_training_alone() -> None:
+def test_commands_widen_in_training_but_not_in_scores() -> None:
     env = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
     scored = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
     for epoch, share in ((0, 0.5), (150, 0.75), (200, 1.0)):
@@ -164,7 +164,7 @@ def test_costs_that_never_rise_are_refused() -> None:
 
 
 @pytest.mark.parametrize("robot", ["go1", "g1"])
-def test_reward_and_observation_have_the_gradient_of_their_own_values(robot: str) -> None:
+def test_gradients_of_reward_and_observation_match_finite_differences(robot: str) -> None:
     env = make(1, robot, commands={"velocity": {"stand": (1.0, 1.0), "lin_vel_x": (0.5, 0.5)}}, reward={"tail": 0.5})
     rng = np.random.default_rng(3)
     parts = [part[0].numpy().astype(float) for part in env.state.physics[:2]]
@@ -206,7 +206,7 @@ class Own(VelocityEnv[Any]):
     terms = G1_TERMS
 
 
-def test_a_class_of_ones_own_has_the_terms_it_lists() -> None:
+def test_a_derived_class_has_the_terms_it_lists() -> None:
     env = Own(Own.Settings(name="own"), PhysicsConfig(), 2, "cpu", 0, None)
     assert {"angular_momentum", "self_collisions"} < set(env.reward_names)
     step = env.step(torch.zeros(2, 12))
@@ -214,7 +214,7 @@ def test_a_class_of_ones_own_has_the_terms_it_lists() -> None:
     assert torch.isfinite(step.terms).all()
 
 
-def test_each_joint_has_one_pattern() -> None:
+def test_each_joint_must_match_one_pattern_of_the_pose_spread() -> None:
     assert by_joint({".*hip": 1.0, "knee": 2.0}, ("left_hip", "knee")) == [1.0, 2.0]
     with pytest.raises(ConfigError, match="no pattern matches joint 'ankle'"):
         by_joint({"hip": 1.0}, ("hip", "ankle"))
@@ -234,7 +234,7 @@ SERVO = '<position joint="knee" kp="50" forcerange="-40 40"/>'
         ("<freejoint/>", SERVO.replace("position", "motor").replace('kp="50"', ""), "position servo"),
     ],
 )
-def test_a_model_whose_joints_cannot_be_moved_is_refused(joint: str, servo: str, message: str) -> None:
+def test_a_model_without_a_servo_on_each_hinge_is_refused(joint: str, servo: str, message: str) -> None:
     """Without a force range, no action would move anything."""
     xml = (
         f'<mujoco><worldbody><body>{joint}<geom size="0.1"/><body pos="0 0 -0.2"><joint name="knee"/><geom size="0.1"/>'
@@ -270,7 +270,7 @@ def test_a_default_pose_outside_the_range_of_a_joint_is_refused() -> None:
         changed({'<compiler angle="radian"/>': ""})
 
 
-def test_all_names_that_a_model_lacks_are_said_at_once() -> None:
+def test_one_error_lists_all_names_that_a_model_lacks() -> None:
     wrong = replace(GO1, base="pelvis", feet=("FR", "left", "right"), foot_parts=("toe",))
     edits = {'body name="terrain"': 'body name="floor"', 'body2="terrain"': 'body2="floor"', 'name="imu_ang_vel"': ""}
     with pytest.raises(ConfigError) as refused:
@@ -283,7 +283,7 @@ def test_all_names_that_a_model_lacks_are_said_at_once() -> None:
     )
 
 
-def test_sensors_are_needed_by_those_that_observe_them() -> None:
+def test_missing_sensors_are_an_error_only_if_they_are_observed() -> None:
     without = {'name="imu_ang_vel"': "", 'name="imu_lin_vel"': ""}
     with pytest.raises(ConfigError, match=r"no sensor 'imu_lin_vel' \(velocimeter\), 'imu_ang_vel' \(gyro\)"):
         changed(without)
@@ -291,7 +291,7 @@ def test_sensors_are_needed_by_those_that_observe_them() -> None:
     assert torch.isfinite(env.step(torch.zeros(1, 12)).reward).all()
 
 
-def test_episodes_end_at_a_low_base_in_training_alone() -> None:
+def test_episodes_end_at_a_low_base_in_training_but_not_in_scores() -> None:
     env = make(3, "g1", termination_height=0.57)
     state = env.state.physics
     qpos = state.qpos.clone()
@@ -302,7 +302,7 @@ def test_episodes_end_at_a_low_base_in_training_alone() -> None:
     assert type(env).reference_settings(env.config).termination_height == 0.0
 
 
-def test_height_on_rough_ground_is_that_above_it() -> None:
+def test_base_height_on_rough_ground_is_measured_from_the_ground_below() -> None:
     env = make(4, "go1")
     rough = make_rough(4, termination_height=0.14)
     state = rough.state.physics

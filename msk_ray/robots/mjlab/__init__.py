@@ -1,1 +1,1 @@
-"""Scoring in mjlab's own environments."""
+"""Evaluation of policies in mjlab's own environments."""

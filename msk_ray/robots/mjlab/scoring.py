@@ -1,4 +1,4 @@
-"""`evaluate --in mjlab`: a policy in mjlab's unmodified velocity or tracking task, in a Python of its own.
+"""`evaluate --in mjlab`: evaluates a policy in mjlab's unmodified velocity or tracking task, in another Python.
 
 mjlab 1.6 needs MuJoCo 3.11 and msk_ray 4.0, so one environment cannot hold both.
 
@@ -38,17 +38,18 @@ TASKS: Final = {
     "g1_velocity": "Mjlab-Velocity-Flat-Unitree-G1",
     "g1_tracking": "Mjlab-Tracking-Flat-Unitree-G1",
 }
-"""By name, because a class derived from one of these may be another robot with as many joints."""
+"""mjlab's task for each environment, by its name: a class derived from one may be another robot with as many joints."""
 PLAY: Final = "mjlab play"
+"""mjlab's settings for playing: friction, encoder bias and centre of mass are random."""
 PUSHED: Final = "mjlab pushed"
-"""With the pushes and the noise of mjlab's training; friction, encoder bias and centre of mass are random in both."""
+"""The same with the pushes and the noise of mjlab's training."""
 EPISODES_ON_GPU: Final = 256
 EPISODES_ON_CPU: Final = 8
 STEPS: Final = 1000
 
 
 def task_of(config: Config) -> str:
-    """The task of mjlab in which a trial's policy acts.
+    """Name of the mjlab task that a trial's policy can act in.
 
     Raises:
         ConfigError: there is none.
@@ -74,10 +75,10 @@ def task_of(config: Config) -> str:
 
 @contextmanager
 def motion_of(config: Config) -> Iterator[str | None]:
-    """A file with the clip that a policy follows, for mjlab; None if it follows none.
+    """Path of a temporary file with the clip that a policy follows, for mjlab; None if it follows none.
 
     Raises:
-        ConfigError: it follows several.
+        ConfigError: the policy follows several clips.
     """
     env = config.env
     if not isinstance(env, G1TrackingSettings):
@@ -95,7 +96,7 @@ def motion_of(config: Config) -> Iterator[str | None]:
 
 
 def mjlab_actions(config: Config) -> Callable[[Observations, Observations], Observations]:
-    """A function from observations (W, O) and the policy's actions (W, J) for them to mjlab's actions."""
+    """A function from observations (W, O) and the policy's actions for them (W, J) to mjlab's actions (W, J)."""
     env = config.env
     assert isinstance(env, ServoSettings)
     scale = env.action_range
@@ -115,15 +116,16 @@ class MjlabScorer:
     """
 
     def __init__(self, python: Path) -> None:
-        self._python = python.absolute()  # not resolved: a virtual environment's is a link to another
+        # Not resolved: the interpreter of a virtual environment is a link to another one.
+        self._python = python.absolute()
 
     def check(self, config: Config, request: Request) -> None:
-        """Raise ConfigError if a trial's policy does not act in this environment. Runs nothing."""
+        """Raise ConfigError if a trial's policy cannot act in a task of mjlab. Runs nothing."""
         task_of(config)
 
     def requests(self, worlds: int | None, seeds: tuple[int, ...] | None, steps: int | None) -> list[Request]:
-        """With mjlab's settings for playing, and with pushes and noise: 256 episodes of 1000 steps on a GPU, 8 on a
-        CPU, with seed 0, unless other numbers are given."""
+        """Two requests, `PLAY` and `PUSHED`: 256 episodes of 1000 steps on a GPU, 8 on a CPU, with seed 0, unless other
+        numbers are given."""
         episodes = EPISODES_ON_GPU if torch.cuda.is_available() else EPISODES_ON_CPU
         return [Request(name, worlds or episodes, seeds or (0,), steps or STEPS) for name in (PLAY, PUSHED)]
 
@@ -131,7 +133,7 @@ class MjlabScorer:
         """One entry of `eval.json`: what was evaluated, how, and the results. `request` is one of `requests`.
 
         Raises:
-            ConfigError: the policy does not act in this environment, or mjlab is missing or of another version.
+            ConfigError: the policy cannot act in a task of mjlab, or mjlab is missing or has another version.
             SimulationError: mjlab stopped.
         """
         task = task_of(policy.config)
@@ -139,50 +141,54 @@ class MjlabScorer:
         assert request.worlds is not None
         assert request.steps is not None
         seeds = request.seeds or (0,)
-        asked = {"task": task, "pushed": request.physics == PUSHED, "worlds": request.worlds, "steps": request.steps}
+        order = {"task": task, "pushed": request.physics == PUSHED, "worlds": request.worlds, "steps": request.steps}
         runs = []
         with motion_of(policy.config) as motion:
             for seed in seeds:
-                with _Worker(self._python, {**asked, "seed": seed, "motion": motion}) as running:
-                    runs.append(running.episodes(policy))
-        setup = EvaluationSetup(request.physics, False, request.worlds, seeds, request.steps, running.device)
-        return entry_of(policy, setup, runs, running.terms) | {"mjlab": running.versions}
+                with _Worker(self._python, {**order, "seed": seed, "motion": motion}) as process:
+                    runs.append(process.episodes(policy))
+        setup = EvaluationSetup(request.physics, False, request.worlds, seeds, request.steps, process.device)
+        return entry_of(policy, setup, runs, process.terms) | {"mjlab": process.versions}
 
 
 class _Worker(ForeignProcess):
-    """A process of mjlab's Python.
+    """A process of mjlab's Python that runs the episodes of one seed.
+
+    Args:
+        python: the interpreter.
+        order: what to run, as `worker` describes.
 
     Attributes:
-        device: it runs on.
-        terms: names of the parts of the reward.
+        device: name of the device that it runs on.
+        terms: names of the reward terms.
     """
 
-    def __init__(self, python: Path, asked: dict[str, Any]) -> None:
-        super().__init__(MJLAB, python, worker.__file__, asked)
-        self._asked = asked
+    def __init__(self, python: Path, order: dict[str, Any]) -> None:
+        super().__init__(MJLAB, python, worker.__file__, order)
+        self._order = order
         self.device: str = self.hello["device"]
         self.terms: list[str] = self.hello["terms"]
         self._observations: int = self.hello["observations"]
-        command = worker.followed(asked["motion"])
+        command = worker.command_name(order["motion"])
         self._record = worker.record(self._observations, len(self.terms), command)
         self._errors = worker.ERRORS[command]
 
     def episodes(self, policy: SavedPolicy) -> Episodes:
         """The first episode of each world."""
-        worlds, actions = self._asked["worlds"], mjlab_actions(policy.config)
+        worlds, actions = self._order["worlds"], mjlab_actions(policy.config)
         obs = self.read(np.dtype(("<f4", (self._observations,))), worlds)
         running = np.ones(worlds, dtype=bool)
         fell = np.zeros(worlds, dtype=bool)
         length = np.zeros(worlds)
         summed = ("reward", "terms", *self._errors)
         sums = {name: np.zeros((worlds, *self._record[name].shape)) for name in summed}
-        for _ in range(self._asked["steps"]):
+        for _ in range(self._order["steps"]):
             self.write(actions(obs, policy(obs)))
             step = self.read(self._record, worlds)
             length += running
             ended = running & step["terminated"]
             for name, total in sums.items():
-                # A world that fell is elsewhere already when errors are measured.
+                # A world that fell has been reset before errors are measured.
                 counted = running & ~ended if name in self._errors else running
                 total[counted] += step[name][counted]
             fell |= ended

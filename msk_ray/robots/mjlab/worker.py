@@ -1,9 +1,9 @@
 """Runs episodes of an unmodified task of mjlab for `scoring`, in a Python that has mjlab.
 
-That Python has other versions of MuJoCo and lacks this package, so this file imports nothing of it. It is started with
-one JSON argument {task, seed, worlds, steps, pushed, motion}. On standard output it writes a line of JSON, which says
-what it runs, then the first observations, and a `record` after each step, of all worlds; on standard input it reads
-their actions before each step. mjlab's own messages go to standard error.
+That Python has another version of MuJoCo and lacks this package, so this file imports nothing from it. It is started
+with one JSON argument {task, seed, worlds, steps, pushed, motion}. On standard output it writes a line of JSON that
+says what it runs, then the first observations of all worlds, and after each step a `record` of each world. On standard
+input it reads the actions of all worlds before each step. mjlab's own messages go to standard error.
 """
 
 import importlib.metadata
@@ -15,11 +15,11 @@ import numpy as np
 
 PACKAGES = ("mjlab", "mujoco", "mujoco-warp", "torch")
 ERRORS = {"twist": ("linear_error", "yaw_error"), "motion": ("mpkpe", "r_mpkpe")}
-"""What is measured besides, by the command that is followed."""
+"""Errors that are measured besides the reward, for each command of mjlab."""
 
 
 def record(observations: int, terms: int, command: str) -> np.dtype:
-    """What follows a step, for each world."""
+    """The type of what is written after a step for each world."""
     return np.dtype(
         [
             ("reward", "<f4"),
@@ -32,7 +32,7 @@ def record(observations: int, terms: int, command: str) -> np.dtype:
 
 
 def velocity_errors(env, command):  # type: ignore[no-untyped-def]
-    """Distances of the base's velocities from the command."""
+    """Differences between the base's velocity and the command, each (W,)."""
     import torch
 
     robot = env.scene["robot"].data
@@ -44,7 +44,7 @@ def velocity_errors(env, command):  # type: ignore[no-untyped-def]
 
 
 def motion_errors(env, command):  # type: ignore[no-untyped-def]
-    """Distances of the bodies from those of the motion."""
+    """mjlab's mean distances of the bodies from those of the motion [m], each (W,)."""
     from mjlab.tasks.tracking.mdp.metrics import compute_mpkpe, compute_root_relative_mpkpe
 
     return {"mpkpe": compute_mpkpe(command), "r_mpkpe": compute_root_relative_mpkpe(command)}
@@ -53,8 +53,16 @@ def motion_errors(env, command):  # type: ignore[no-untyped-def]
 def task_for_scoring(  # type: ignore[no-untyped-def]
     task: str, pushed: bool, worlds: int, seed: int, device: str, motion: str | None = None
 ):
-    """The environment of a task with mjlab's settings for playing, or with training's pushes and noise besides; and the
-    distances from the command, which are filled in each step. A task that follows a motion needs its file."""
+    """The environment of a mjlab task, and a dictionary into which each step writes the errors (W,) by name.
+
+    Args:
+        task: name of the task.
+        pushed: whether to add the pushes and noise of training to mjlab's settings for playing.
+        worlds: number of worlds W.
+        seed: seed of the environment.
+        device: "cpu" or "cuda:N".
+        motion: path of the clip, for a task that follows one.
+    """
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.tasks.registry import load_env_cfg
 
@@ -66,38 +74,38 @@ def task_for_scoring(  # type: ignore[no-untyped-def]
         cfg.commands["motion"].motion_file = motion
     cfg.scene.num_envs, cfg.seed = worlds, seed
     env = ManagerBasedRlEnv(cfg, device)
-    command = env.command_manager.get_term(followed(motion))
+    command = env.command_manager.get_term(command_name(motion))
     measure = velocity_errors if motion is None else motion_errors
     errors: dict = {}
     update = command.compute
 
-    def compute(*given, **named) -> None:  # type: ignore[no-untyped-def]
-        # mjlab calls it when bodies are those of the end of the step; the command is still that of its start.
+    def measure_and_update(*args, **kwargs) -> None:  # type: ignore[no-untyped-def]
+        # At this moment bodies are at the end of the step, and the command is still the one of its start.
         errors.update(measure(env, command))
-        update(*given, **named)
+        update(*args, **kwargs)
 
-    command.compute = compute
+    command.compute = measure_and_update
     return env, errors
 
 
-def followed(motion: str | None) -> str:
-    """Name of the command."""
+def command_name(motion: str | None) -> str:
+    """mjlab's name for the command of a task with or without a motion."""
     return "twist" if motion is None else "motion"
 
 
 def main() -> None:
-    """Run the steps that the argument asks for; worlds that fall begin another episode."""
-    asked = json.loads(sys.argv[1])
+    """Run the steps that the argument orders; worlds that fall begin another episode."""
+    order = json.loads(sys.argv[1])
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # mjlab prints
+    os.dup2(2, 1)  # mjlab prints to standard output, which is for answers alone
     os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is drawn
 
     import torch
 
-    worlds = asked["worlds"]
+    worlds = order["worlds"]
     device = "cuda:0" if torch.cuda.is_available() else "cpu"
-    motion = asked["motion"]
-    env, errors = task_for_scoring(asked["task"], asked["pushed"], worlds, asked["seed"], device, motion)
+    motion = order["motion"]
+    env, errors = task_for_scoring(order["task"], order["pushed"], worlds, order["seed"], device, motion)
     obs, _ = env.reset()
     terms = env.reward_manager.active_terms
     observations, actions = obs["actor"].shape[1], env.action_manager.total_action_dim
@@ -111,13 +119,13 @@ def main() -> None:
     answers.write(json.dumps(hello).encode() + b"\n")
     answers.write(obs["actor"].cpu().numpy().astype("<f4").tobytes())
     answers.flush()
-    answer = np.zeros(worlds, record(observations, len(terms), followed(motion)))
-    for _ in range(asked["steps"]):
-        given = np.frombuffer(sys.stdin.buffer.read(4 * worlds * actions), "<f4").reshape(worlds, actions)
-        obs, reward, terminated, _, _ = env.step(torch.from_numpy(given.copy()).to(device))
+    answer = np.zeros(worlds, record(observations, len(terms), command_name(motion)))
+    for _ in range(order["steps"]):
+        action = np.frombuffer(sys.stdin.buffer.read(4 * worlds * actions), "<f4").reshape(worlds, actions)
+        obs, reward, terminated, _, _ = env.step(torch.from_numpy(action.copy()).to(device))
         weighted = env.reward_manager._step_reward * env.step_dt
-        found = {"reward": reward, "terms": weighted, "terminated": terminated, "obs": obs["actor"], **errors}
-        for name, value in found.items():
+        results = {"reward": reward, "terms": weighted, "terminated": terminated, "obs": obs["actor"], **errors}
+        for name, value in results.items():
             answer[name] = value.cpu().numpy()
         answers.write(answer.tobytes())
         answers.flush()

@@ -2,5 +2,5 @@
 
 from msk_ray.cli import Command
 
-MOTIONS = Command("msk_ray.robots.tracking.list_motions", "list motions to follow, check them, and draw them")
-TRACK = Command("msk_ray.robots.tracking.track", "follow each clip once, from its first frame: one row a clip")
+MOTIONS = Command("msk_ray.robots.tracking.list_motions", "list motions to follow, check them and draw them")
+TRACK = Command("msk_ray.robots.tracking.track", "score a policy on each clip, followed once from its first frame")

@@ -1,12 +1,13 @@
-"""How well a policy follows each clip of a library, once and from its first frame.
+"""Scores of a policy on each clip of a library, which it follows once from its first frame.
 
-After Appendix F of SuperMimic (arXiv:2610.28480), as far as it is known here: docs/robots/tracking.md.
+The protocol is Appendix F of SuperMimic (arXiv:2610.28480); docs/robots/tracking.md says which parts are guesses.
 """
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from msk_ray.config import Config
 from msk_ray.errors import ConfigError
 from msk_ray.robots.tracking.config import MOTION_TERMS, G1TrackingSettings
 from msk_ray.robots.tracking.env import G1Tracking
@@ -15,22 +16,25 @@ from msk_ray.training import Evaluator, SavedPolicy
 
 @dataclass(frozen=True)
 class ClipScore:
-    """One clip, followed once."""
+    """How a policy followed one clip."""
 
     clip: str
+    """Name of the clip."""
     seconds: float
+    """Duration of the clip [s]."""
     failed: bool
-    """The pelvis was off by more than 0.25 m in height or 0.8 in tilt, or the physics diverged."""
+    """Whether the pelvis was off by more than 0.25 m in height, or by 0.8 in the vertical component of gravity in its
+    axes, or the physics diverged."""
     followed: float
-    """Share of the clip until then."""
+    """Share of the clip before the failure; 1 without one."""
     normalised_return: float
-    """Return, divided by the greatest one of the whole clip: 1 if every step is as the reference, without costs."""
+    """Return divided by the largest possible one: 1 if every step matches the reference and costs nothing."""
     normalised_motion: float
-    """The same without costs."""
+    """The same from the motion terms alone, without costs."""
     mpkpe: float
-    """Mean distance of the tracked bodies from where the clip has them, while it was followed [m]."""
+    """Mean distance of the tracked bodies from the reference, over the part that was followed [m]."""
     r_mpkpe: float
-    """That with the clip moved to the robot [m]."""
+    """The same after moving the reference to the robot's anchor and turning it to the robot's heading [m]."""
 
 
 def follow_clips(
@@ -39,17 +43,47 @@ def follow_clips(
     motion: str | None = None,
     pace: Callable[[int], Callable[[int], None]] | None = None,
 ) -> list[ClipScore]:
-    """Scores of all clips, by one deterministic policy, without noise.
+    """Let a policy follow each clip, deterministically, without noise and from the first frame.
 
     Args:
-        policy: the policy.
+        policy: a policy of `g1_tracking`.
         device: "cpu" or "cuda:N".
-        motion: clips to follow, as `env.motion`; None: those that it was trained on.
-        pace: is given the largest number of steps, and gives what to call after each.
+        motion: clips to follow, as in `env.motion`; None: those that the policy was trained on.
+        pace: makes a progress display for a number of env steps; the display is called after each step with the number
+            of steps done.
 
     Raises:
-        ConfigError: the policy does not follow motions, or there are none.
+        ConfigError: the policy does not follow motions, or there are no clips.
     """
+    evaluator = Evaluator(_evaluation_config(policy, motion), device)
+    env = evaluator.env
+    assert isinstance(env, G1Tracking)
+    progress = None if pace is None else pace(evaluator.steps)
+    episodes = evaluator.episodes(policy.on(env), pace=progress).cpu()
+    weights = type(env.config.reward)()
+    largest_reward = sum(float(getattr(weights, name)) for name in MOTION_TERMS)
+    motion_columns = [env.reward_names.index(name) for name in MOTION_TERMS]
+    scores = []
+    for world, (clip, length) in enumerate(zip(env.references.names, env.references.lengths, strict=True)):
+        steps = float(episodes.length[world])
+        largest_return = largest_reward * length
+        scores.append(
+            ClipScore(
+                clip=clip,
+                seconds=length * env.config.control_timestep,
+                failed=bool(episodes.fell[world] | episodes.diverged[world]),
+                followed=steps / length,
+                normalised_return=float(episodes.score[world]) / largest_return,
+                normalised_motion=float(episodes.terms[world, motion_columns].sum()) / largest_return,
+                mpkpe=float(episodes.outcomes["mpkpe"][world]) / steps,
+                r_mpkpe=float(episodes.outcomes["r_mpkpe"][world]) / steps,
+            )
+        )
+    return scores
+
+
+def _evaluation_config(policy: SavedPolicy, motion: str | None) -> Config:
+    """A policy's config with one world for each clip; worlds begin with the first frame and fail by the pelvis."""
     env = policy.config.env
     if not isinstance(env, G1TrackingSettings):
         raise ConfigError(f"{policy.path}: env {env.name} follows no motions; write a policy of g1_tracking")
@@ -57,33 +91,14 @@ def follow_clips(
     settings = env.model_copy(update=changes | ({} if motion is None else {"motion": motion}))
     lengths = G1Tracking.library(settings).lengths
     evaluation = policy.config.evaluation.model_copy(update={"nworld": len(lengths), "steps": max(lengths)})
-    config = policy.config.model_copy(update={"env": settings, "evaluation": evaluation})
-    evaluator = Evaluator(config, device)
-    assert isinstance(evaluator.env, G1Tracking)
-    tell = None if pace is None else pace(evaluator.steps)
-    episodes = evaluator.episodes(policy.on(evaluator.env), pace=tell).cpu()
-    names, weights = evaluator.env.reward_names, type(env.reward)()
-    motions = [names.index(name) for name in MOTION_TERMS]
-    greatest = sum(float(getattr(weights, name)) for name in MOTION_TERMS)
-    scores = []
-    for world, (clip, length) in enumerate(zip(evaluator.env.references.names, lengths, strict=True)):
-        steps = float(episodes.length[world])
-        scores.append(
-            ClipScore(
-                clip,
-                length * settings.control_timestep,
-                bool(episodes.fell[world] | episodes.diverged[world]),
-                steps / length,
-                float(episodes.score[world]) / (greatest * length),
-                float(episodes.terms[world, motions].sum()) / (greatest * length),
-                *(float(episodes.outcomes[name][world]) / steps for name in ("mpkpe", "r_mpkpe")),
-            )
-        )
-    return scores
+    return policy.config.model_copy(update={"env": settings, "evaluation": evaluation})
 
 
 def totals(scores: list[ClipScore]) -> dict[str, Any]:
-    """Number of clips and of those that failed, and means over clips; `by_time` is the mean return over all frames."""
+    """Number, duration [s] and failures of all clips, and means of the other figures over clips.
+
+    `by_time` is the mean of `normalised_return` over frames instead of clips.
+    """
     seconds = sum(score.seconds for score in scores)
     figures = ("followed", "normalised_return", "normalised_motion", "mpkpe", "r_mpkpe")
     means = {name: sum(getattr(score, name) for score in scores) / len(scores) for name in figures}
@@ -93,9 +108,9 @@ def totals(scores: list[ClipScore]) -> dict[str, Any]:
 
 
 def as_json(scores: list[ClipScore], policy: SavedPolicy) -> dict[str, Any]:
-    """What `clips.json` says."""
+    """The content of `clips.json`."""
     env = policy.config.env
     assert isinstance(env, G1TrackingSettings)
-    facts = {"checkpoint": policy.path.name, "epoch": policy.epoch, "env_steps": policy.env_steps}
-    seen = {"layout": env.layout, "future_frames": list(env.future_frames)}
-    return {**facts, **seen, "totals": totals(scores), "clips": [asdict(score) for score in scores]}
+    origin = {"checkpoint": policy.path.name, "epoch": policy.epoch, "env_steps": policy.env_steps}
+    observation = {"layout": env.layout, "future_frames": list(env.future_frames)}
+    return {**origin, **observation, "totals": totals(scores), "clips": [asdict(score) for score in scores]}

@@ -19,8 +19,8 @@ class TrackingShape(Reward):
     """The settings of terms other than their weights."""
 
     tail: Fraction = 0.0
-    """Share of 1/(1 + x) in the six terms of the motion, which are e^−x in scores: that has no slope far from it. For
-    training."""
+    """Share of 1/(1 + x) in the six motion terms, for training. In scores they are e^−x, which has no slope far from
+    the motion."""
 
 
 TRACKING_TERMS = terms_in(
@@ -36,7 +36,7 @@ TRACKING_TERMS = terms_in(
     Term("self_collisions", -10.0, "msk_ray.robots.terms:self_collisions", gradient=False, schedule=cost_share),
 )
 MOTION_TERMS = tuple(term.name for term in TRACKING_TERMS if term.name.startswith("motion_"))
-"""Those that say how close the robot is to the motion; each is 1 at most, times its weight."""
+"""The terms that measure how close the robot is to the motion; each is at most 1, times its weight."""
 G1TrackingReward = reward_section("G1TrackingReward", __name__, TRACKING_TERMS, TrackingShape)
 
 
@@ -46,11 +46,11 @@ class G1TrackingSettings(ServoSettings):
 
     episode_length: Count = 500
     reset_noise: NonNegative = 1.0
-    """Share of mjlab's noise in initial poses: 5 cm, 1 cm upward, 0.1 rad of tilt, 0.2 rad of heading, and 0.1 rad of
-    each joint at most. 0 in scores."""
+    """Share of mjlab's noise in initial poses, which is at most 5 cm along x and y, 1 cm along z, 0.1 rad of roll and
+    pitch, 0.2 rad of yaw, and 0.1 rad in each joint. 0 in scores."""
     reset_velocity_noise: NonNegative = 1.0
-    """Share of mjlab's noise in initial velocities of the base: 0.5 m/s, 0.2 m/s upward, 0.52 rad/s of tilt and 0.78
-    rad/s of heading at most. 0 in scores."""
+    """Share of mjlab's noise in initial velocities of the base, which is at most 0.5 m/s along x and y, 0.2 m/s along
+    z, 0.52 rad/s of roll and pitch, and 0.78 rad/s of yaw. 0 in scores."""
     motion: Text = "builtin:squat"
     """Motions to follow: a file .csv or .npz, a folder of them, or a built-in one."""
     cut: tuple[NonNegative, NonNegative] | None = None
@@ -58,23 +58,23 @@ class G1TrackingSettings(ServoSettings):
     mirror: bool = False
     """Follow each motion's mirror image too."""
     layout: Literal["full", "no_state_estimation"] = "full"
-    """What the policy sees: `full` has the position of the anchor and the velocity of the IMU, which a robot cannot
-    measure; mjlab calls the other one so. The critic sees all of it, and position and
-    orientation of all tracked bodies."""
+    """What the policy sees. `full` includes the position of the reference's torso and the velocity of the IMU, which a
+    real robot cannot measure; `no_state_estimation` (mjlab's name) leaves both out. The critic sees the full layout and
+    the pose of every tracked body in either case."""
     future_frames: tuple[Offset, ...] = ()
-    """Env steps ahead whose reference the policy sees too, such as [1, 2, 4, 8]."""
+    """The policy also sees the reference this many env steps ahead, such as [1, 2, 4, 8]."""
     action_about: Literal["default", "reference"] = "default"
-    """What an action of 0 asks of the joints: the default pose, as in mjlab, or the reference's angles."""
+    """Joint targets for an action of 0: the default pose, as in mjlab, or the reference's angles."""
     sampling: Sampling = "adaptive"
-    """Where episodes of training begin: anywhere, but more often where they have failed (`adaptive`), anywhere
-    (`uniform`), or with the first frame of each motion (`start`)."""
+    """Where training episodes begin: anywhere, but more often where episodes have failed (`adaptive`), anywhere
+    (`uniform`), or at the first frame of each motion (`start`)."""
     score_sampling: Literal["uniform", "start"] = "uniform"
-    """The same for scores."""
+    """Where scored episodes begin."""
     failure: Failure = "mjlab"
-    """When an episode of training ends early: as in mjlab (height or tilt of the torso, or the height of a hand or
-    foot, is far off), or by height and tilt of the `pelvis` alone."""
+    """When a training episode ends early: as in mjlab, when the height or tilt of the torso or the height of a hand or
+    foot is far off (`mjlab`), or when the height or tilt of the pelvis is (`pelvis`)."""
     score_failure: Failure = "mjlab"
-    """The same for scores."""
+    """When a scored episode ends early."""
     cost_schedule: CostSchedule | None = None
     """Factor on the weights of `action_rate_l2` and `self_collisions` in training; null: 1."""
     reward: TrackingShape = TrackingShape()

@@ -1,6 +1,6 @@
 """A humanoid that follows motions of people. Source: `mjlab/tasks/tracking` of mjlab 1.6.0.
 
-Axes: W worlds, J joints but for the free one, B tracked bodies.
+Axes: W worlds, J joints except the free one, B tracked bodies, N episodes.
 """
 
 from collections.abc import Mapping
@@ -20,57 +20,59 @@ from msk_ray.robots.tracking.references import Library, Reference, References, S
 from msk_ray.step import StepState
 from msk_ray.step.autograd.tangent import quat_conjugate, quat_log, quat_multiply, quat_rotate
 
-_HEIGHT: Final = 0.25
-"""Error of a height with which an episode ends [m]."""
-_TILT: Final = 0.8
-"""Error of the vertical part of the direction of gravity, in the axes of a body, with which it does."""
+_LARGEST_HEIGHT_ERROR: Final = 0.25
+"""Beyond it an episode ends [m]."""
+_LARGEST_TILT_ERROR: Final = 0.8
+"""Beyond it an episode ends; the tilt is the vertical component of the direction of gravity in a body's axes."""
 _POSE_NOISE: Final = (0.05, 0.05, 0.01, 0.1, 0.1, 0.2)
-"""Half the range of the initial position [m], then of roll, pitch and yaw [rad]."""
+"""Largest noise of the base's initial position [m], then of its roll, pitch and yaw [rad]."""
 _VELOCITY_NOISE: Final = (0.5, 0.5, 0.2, 0.52, 0.52, 0.78)
-"""Half the range of the base's initial velocity [m/s], then of its angular velocity [rad/s]."""
+"""Largest noise of the base's initial velocity [m/s], then of its angular velocity [rad/s]."""
 _JOINT_NOISE: Final = 0.1
-"""Half the range of initial joint angles [rad]."""
+"""Largest noise of initial joint angles [rad]."""
 
 
 class Deviation(NamedTuple):
-    """What separates a state from the reference of the state before: reference minus robot, in world coordinates."""
+    """Reference minus robot, in world coordinates."""
 
     anchor_position: Tensor
-    """[m], (W, 3)."""
+    """Of the anchor [m], (W, 3)."""
     anchor_rotation: Tensor
-    """Rotation vector [rad], (W, 3)."""
+    """Of the anchor, a rotation vector [rad], (W, 3)."""
     position: Tensor
-    """Of the bodies, where the reference is moved to the robot's anchor and turned to its heading [m], (W, B, 3)."""
+    """Of the tracked bodies, after the reference is moved to the robot's anchor and turned to the robot's heading [m],
+    (W, B, 3)."""
     rotation: Tensor
-    """The same [rad], (W, B, 3)."""
+    """Of the tracked bodies after the same turn, rotation vectors [rad], (W, B, 3)."""
     velocity: Tensor
-    """[m/s], (W, B, 3)."""
+    """Of the tracked bodies [m/s], (W, B, 3)."""
     angular_velocity: Tensor
-    """[rad/s], (W, B, 3)."""
+    """Of the tracked bodies [rad/s], (W, B, 3)."""
 
 
 class G1Tracking(ServoEnv[G1TrackingSettings]):
     """mjlab's `Mjlab-Tracking-Flat-Unitree-G1`: Unitree's humanoid G1 follows motions.
 
-    Observation (160 with `layout: full`, 154 without what a robot cannot measure), in this order:
+    The anchor is the torso. Observation (160 with `layout: full`; 154 with `no_state_estimation`, which lacks the rows
+    marked `full`), in this order:
 
     ======= ==========================================================================
     J, J    angles [rad] and rates [rad/s] of the reference's joints
     3       position of the reference's anchor in the axes of the robot's [m]; `full`
-    6       first two columns of its orientation in these axes, row by row
+    6       its rotation matrix in these axes: the first two columns, row by row
     3       velocity of the IMU in its own axes [m/s]; `full`
     3       angular velocity of the IMU in its own axes [rad/s]
     J       angles of the joints minus those of the default pose [rad]
     J       their rates [rad/s]
-    J       last action, as mjlab counts it
+    J       last action, in mjlab's units
     ======= ==========================================================================
 
-    then the first four for each of `future_frames`. The critic sees all of it, and position and orientation of all
-    tracked bodies in the axes of the anchor, as in mjlab. The anchor is the torso.
+    followed by the first three rows again for each of `future_frames`. As in mjlab, the critic sees the full layout,
+    and then the position and orientation of every tracked body in the axes of the robot's anchor.
 
-    The reference of a world is a frame of the library: that in which its episode began, plus its age. As in mjlab, the
-    reward for a step compares the state reached with the reference that the policy saw before it; the reference that
-    the observation shows afterwards is the next one. Episodes are cut where a clip ends.
+    A world's reference is a frame of the library: the frame in which its episode began plus the episode's age. As in
+    mjlab, the reward for a step compares the state it led to with the reference that the policy saw before the step;
+    the next observation shows the next reference. Episodes time out at the end of their clip.
     """
 
     Settings = G1TrackingSettings  # type: ignore[assignment]
@@ -86,15 +88,18 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         *(f"left_{part}_link" for part in ("shoulder_roll", "elbow", "wrist_yaw")),
         *(f"right_{part}_link" for part in ("shoulder_roll", "elbow", "wrist_yaw")),
     )
-    """The tracked ones; the base is the first."""
-    ends: ClassVar = tuple(f"{side}_{part}_link" for part in ("ankle_roll", "wrist_yaw") for side in ("left", "right"))
-    """Bodies whose heights end episodes."""
+    """The tracked bodies; the base comes first."""
+    hands_and_feet: ClassVar = tuple(
+        f"{side}_{part}_link" for part in ("ankle_roll", "wrist_yaw") for side in ("left", "right")
+    )
+    """Tracked bodies that end an episode when their height is far off."""
 
     def prepare(self) -> None:
         super().prepare()
         config, rate = self.config, 1.0 / self.config.control_timestep
         self._anchor = self.bodies.index(self.anchor)
-        self._ends = torch.tensor([self.bodies.index(body) for body in self.ends], device=self.device)
+        limbs = [self.bodies.index(body) for body in self.hands_and_feet]
+        self._hands_and_feet = torch.tensor(limbs, device=self.device)
         library = library_of(Source.of(config, self.model, self.bodies))
         self.references = References(library, self._anchor, self.device)
         self.start_frames = StartFrames(self.references, rate, config.sampling)
@@ -124,7 +129,7 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         return self.draw_start(count)[0]
 
     def draw_start(self, count: int) -> tuple[StepState, Tensor]:
-        """The numbers of an episode are the frame at age 0 and the last frame of its clip."""
+        """Initial states, and as numbers of each episode its frame at age 0 and the last frame of its clip, (N, 2)."""
         if self.config.sampling == "start":
             worlds, clips = self.nworld * self.group.size, len(self.references.lengths)
             clip = torch.arange(count, device=self.device) % worlds % clips
@@ -134,24 +139,23 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         return self._noisy(first), torch.stack((first, last), dim=-1).float()
 
     def _noisy(self, frame: Tensor) -> StepState:
-        """States near those of frames (N,)."""
+        """The states in frames (N,), with noise in pose and velocity."""
         count = len(frame)
-        base, joints = (part[:, 0] for part in self.references.bodies(frame)), self.references.joints(frame)
-        position, orientation, velocity, spin = base
+        position, orientation, velocity, spin = (part[:, 0] for part in self.references.bodies(frame))
+        angles, rates = self.references.joints(frame).chunk(2, dim=-1)
         shift = self._pose_noise * self.uniform(count, 6)
         orientation = quat_multiply(_from_euler(shift[:, 3:]), orientation)
         push = self._velocity_noise * self.uniform(count, 6)
-        angles, rates = joints.chunk(2, dim=-1)
         angles = (angles + self._joint_noise * self.uniform(count, angles.shape[1])).clamp(*self.joint_limits)
-        turning = quat_rotate(quat_conjugate(orientation), spin + push[:, 3:])
+        spin_in_base = quat_rotate(quat_conjugate(orientation), spin + push[:, 3:])
         qpos = torch.cat((position + shift[:, :3], orientation, angles), dim=-1)
-        qvel = torch.cat((velocity + push[:, :3], turning, rates), dim=-1)
+        qvel = torch.cat((velocity + push[:, :3], spin_in_base, rates), dim=-1)
         return StepState(qpos, qvel, self._act.repeat(count, 1))
 
     def spread_ages(self) -> None:
         super().spread_ages()
         numbers = self.state.numbers.clone()
-        # The episode goes on in the frame whose state the world is in.
+        # A world is in the state of its first frame, so that frame now belongs to the age it was given.
         self.task_numbers(numbers)[:, 0] -= self.state.age
         self.state = self.state._replace(numbers=numbers)
 
@@ -172,24 +176,25 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         frames, reference = self.frames(state), self.reference(state)
         if self.config.failure == "pelvis":
             return self._is_off(state, reference, 0)
-        height = frames.position(self.bodies)[..., 2]
-        ends = (reference.position[..., 2] - height).index_select(1, self._ends).abs() > _HEIGHT
-        return ends.any(-1) | self._is_off(state, reference, self._anchor)
+        height_error = reference.position[..., 2] - frames.position(self.bodies)[..., 2]
+        limbs_are_off = height_error.index_select(1, self._hands_and_feet).abs() > _LARGEST_HEIGHT_ERROR
+        return limbs_are_off.any(-1) | self._is_off(state, reference, self._anchor)
 
     def _is_off(self, state: StepState, reference: Reference, body: int) -> Tensor:
-        """Whether height or tilt of a tracked body is far from the reference's, (W,) bool."""
+        """Whether the height or tilt of tracked body number `body` is far from the reference's, (W,) bool."""
         frames, name = self.frames(state), self.bodies[body]
-        height = reference.position[:, body, 2] - frames.position(name)[:, 2]
+        height_error = reference.position[:, body, 2] - frames.position(name)[:, 2]
         upward = quat_rotate(reference.orientation[:, body], -self._down.expand(self.nworld, 3))[:, 2]
-        tilt = upward - frames.axis(name, 2)[:, 2]
-        return (height.abs() > _HEIGHT) | (tilt.abs() > _TILT)
+        tilt_error = upward - frames.axis(name, 2)[:, 2]
+        return (height_error.abs() > _LARGEST_HEIGHT_ERROR) | (tilt_error.abs() > _LARGEST_TILT_ERROR)
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
-        """`mpkpe` is the mean distance of the tracked bodies from where the reference has them [m], `r_mpkpe` that with
-        the reference moved to the robot's anchor and turned to its heading; both as mjlab's."""
+        """mjlab's `mpkpe`, the mean distance of the tracked bodies from the reference [m], and its `r_mpkpe`, the same
+        after moving the reference to the robot's anchor and turning it to the robot's heading."""
+        # The current state is already the one reached: the reference of the step is one frame back.
         reference = self.references.bodies(self.frame(-1))
         robot = self.frames(state).position(self.bodies)
-        moved = self._moved(reference, self.memory["anchor"][:, 7:])[0]
+        moved = self._moved_to_robot(reference, self.memory["anchor"][:, 7:])[0]
         return {
             "mpkpe": torch.linalg.vector_norm(reference.position - robot, dim=-1).mean(-1),
             "r_mpkpe": torch.linalg.vector_norm(moved - robot, dim=-1).mean(-1),
@@ -198,51 +203,56 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
     # What terms and observation use
 
     def frame(self, ahead: int = 0) -> Tensor:
-        """The frame of the reference in the current state, or so many env steps ahead, (W,) int64."""
+        """The reference's frame `ahead` env steps after the current state, at most its clip's last, (W,) int64."""
         first, last = self.task_numbers(self.state.numbers).unbind(-1)
         return torch.minimum(first + (self.state.age + ahead), last).long().clamp_min(0)
 
     def reference(self, state: StepState) -> Reference:
-        """What tracked bodies are to do in the state that a step has led to."""
+        """The reference that a state reached by a step is compared with, in the dtype of the state."""
 
-        def bodies() -> Reference:
-            # In float64 where `diagnose` takes differences in it.
+        def look_up() -> Reference:
+            # `diagnose` takes finite differences in float64.
             return Reference(*(part.to(state.qpos.dtype) for part in self.references.bodies(self.frame())))
 
-        found: Reference = self.measurements.once("reference", state, bodies)
-        return found
+        reference: Reference = self.measurements.once("reference", state, look_up)
+        return reference
 
     def deviation(self, state: StepState) -> Deviation:
-        """How far the state that a step has led to is from the reference of the state in which it began."""
-        found: Deviation = self.measurements.once("deviation", state, lambda: self._deviation(state))
-        return found
+        """Deviation of a state reached by a step from its `reference`."""
+        deviation: Deviation = self.measurements.once("deviation", state, lambda: self._deviation(state))
+        return deviation
 
     def _deviation(self, state: StepState) -> Deviation:
         reference, frames, anchor = self.reference(state), self.frames(state), self._anchor
         position, orientation = frames.position(self.bodies), frames.orientation(self.bodies)
-        moved, turned = self._moved(reference, self.memory["anchor"][:, :7])
+        moved, turned = self._moved_to_robot(reference, self.memory["anchor"][:, :7])
         return Deviation(
             reference.position[:, anchor] - position[:, anchor],
-            _rotation(orientation[:, anchor], reference.orientation[:, anchor]),
+            _rotation_between(orientation[:, anchor], reference.orientation[:, anchor]),
             moved - position,
-            _rotation(orientation, turned),
+            _rotation_between(orientation, turned),
             reference.velocity - frames.velocity(self.bodies),
             reference.angular_velocity - frames.angular_velocity(self.bodies),
         )
 
-    def _moved(self, reference: Reference, anchor: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions and orientations of the reference, turned about its anchor to the heading of the robot's, (W, 7),
-        and moved to where that is, except in height."""
-        own, orientation = anchor.split((3, 4), dim=-1)
-        theirs = reference.position[:, self._anchor]
-        turn = _heading(quat_multiply(orientation, quat_conjugate(reference.orientation[:, self._anchor])))
+    def _moved_to_robot(self, reference: Reference, anchor: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions (W, B, 3) and orientations (W, B, 4) of the reference, moved horizontally to the robot's anchor and
+        turned to its heading.
+
+        Args:
+            reference: the reference.
+            anchor: position and orientation of the robot's anchor, (W, 7).
+        """
+        robot_position, robot_orientation = anchor.split((3, 4), dim=-1)
+        reference_position = reference.position[:, self._anchor]
+        turn = _heading(quat_multiply(robot_orientation, quat_conjugate(reference.orientation[:, self._anchor])))
         turns = turn[:, None].expand(-1, len(self.bodies), -1)
-        to = torch.cat((own[:, :2], theirs[:, 2:]), dim=-1)
-        moved = to[:, None] + quat_rotate(turns, reference.position - theirs[:, None])
+        target = torch.cat((robot_position[:, :2], reference_position[:, 2:]), dim=-1)
+        moved = target[:, None] + quat_rotate(turns, reference.position - reference_position[:, None])
         return moved, quat_multiply(turns, reference.orientation)
 
     def anchor_pose(self, state: StepState) -> Tensor:
-        """Position and orientation of the robot's anchor, (W, 7)."""
+        """Position [m] and orientation of the robot's anchor, (W, 7)."""
         frames = self.frames(state)
         return torch.cat((frames.position(self.anchor), frames.orientation(self.anchor)), dim=-1)
 
@@ -255,12 +265,12 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
     # Memory
 
     def memories(self) -> Mapping[str, Memory]:
-        """Poses of the anchor in the current state and in the one before, and the last action, as mjlab counts it."""
+        """Poses of the anchor in the current state and the one before, and the last action in mjlab's units."""
         return {"anchor": Memory(14, gradient=True), "action": Memory(self.action_size, gradient=True)}
 
     def begin_memory(self, state: StepState) -> Mapping[str, Tensor]:
-        still = torch.zeros((self.nworld, self.action_size), device=self.device)
-        return {"anchor": self.anchor_pose(state).repeat(1, 2), "action": self.mjlab_action(still)}
+        zero_action = torch.zeros((self.nworld, self.action_size), device=self.device)
+        return {"anchor": self.anchor_pose(state).repeat(1, 2), "action": self.mjlab_action(zero_action)}
 
     def remember(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
         anchor = torch.cat((self.anchor_pose(state), self.memory["anchor"][:, :7]), dim=-1)
@@ -269,36 +279,37 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
     # Observation
 
     def observe(self, state: StepState, action: Tensor) -> Tensor:
-        return self._observed(state, full=self.config.layout == "full")
+        return self._observation_of(state, full=self.config.layout == "full")
 
     def observe_critic(self, state: StepState, action: Tensor) -> Tensor:
-        seen = self._observed(state, full=True)
+        full_layout = self._observation_of(state, full=True)
         frames = self.frames(state)
         position, orientation = frames.position(self.bodies), frames.orientation(self.bodies)
         anchor = self._anchor
-        place = _place(position[:, anchor, None], orientation[:, anchor, None], position, orientation)
-        return torch.cat((seen, *(part.flatten(1) for part in place)), dim=-1)
+        poses = _pose_in_axes(position[:, anchor, None], orientation[:, anchor, None], position, orientation)
+        return torch.cat((full_layout, *(part.flatten(1) for part in poses)), dim=-1)
 
-    def _observed(self, state: StepState, full: bool) -> Tensor:
+    def _observation_of(self, state: StepState, full: bool) -> Tensor:
+        """The observation, with the entries that a robot cannot measure if it is `full`."""
         frames, sensors = self.frames(state), self.sensors(state)
-        own = frames.position(self.anchor), frames.orientation(self.anchor)
+        robot_anchor = frames.position(self.anchor), frames.orientation(self.anchor)
 
-        def shown(ahead: int) -> tuple[Tensor, ...]:
+        def reference_entries(ahead: int) -> tuple[Tensor, ...]:
             frame = self.frame(ahead)
-            theirs = self.references.anchor(frame).to(state.qpos.dtype)
-            position, orientation = _place(*own, *theirs.split((3, 4), dim=-1))
+            reference_anchor = self.references.anchor(frame).to(state.qpos.dtype)
+            position, orientation = _pose_in_axes(*robot_anchor, *reference_anchor.split((3, 4), dim=-1))
             joints = self.references.joints(frame)
             return (joints, position, orientation) if full else (joints, orientation)
 
         return torch.cat(
             (
-                *shown(0),
+                *reference_entries(0),
                 *((sensors["imu_lin_vel"],) if full else ()),
                 sensors["imu_ang_vel"],
                 state.qpos[:, 7:] - self.default_pose,
                 state.qvel[:, 6:],
                 self.memory["action"],
-                *(part for ahead in self.config.future_frames for part in shown(ahead)),
+                *(part for ahead in self.config.future_frames for part in reference_entries(ahead)),
             ),
             dim=-1,
         )
@@ -306,22 +317,22 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
     def observation_layout(self) -> list[Entry]:
         full = self.config.layout == "full"
 
-        def shown(when: str) -> list[Entry]:
+        def reference_entries(suffix: str) -> list[Entry]:
             return [
-                *each(self.joint_names, f"reference{when}", "rad"),
-                *each(self.joint_names, f"reference_rate{when}", "rad/s"),
-                *(vector(f"anchor_position{when}", "m") if full else ()),
-                *entries(f"anchor_orientation{when}_{row}{column}" for row in "xyz" for column in "xy"),
+                *each(self.joint_names, f"reference{suffix}", "rad"),
+                *each(self.joint_names, f"reference_rate{suffix}", "rad/s"),
+                *(vector(f"anchor_position{suffix}", "m") if full else ()),
+                *entries(f"anchor_orientation{suffix}_{row}{column}" for row in "xyz" for column in "xy"),
             ]
 
         return [
-            *shown(""),
+            *reference_entries(""),
             *(vector("imu_velocity", "m/s") if full else ()),
             *vector("imu_angular_velocity", "rad/s"),
             *each(self.joint_names, "angle", "rad"),
             *each(self.joint_names, "rate", "rad/s"),
             *entries(f"{joint}_action" for joint in self.joint_names),
-            *(entry for ahead in self.config.future_frames for entry in shown(f"_{ahead}")),
+            *(entry for ahead in self.config.future_frames for entry in reference_entries(f"_{ahead}")),
         ]
 
     # Checkpoints
@@ -335,13 +346,13 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
             self.start_frames.failures.copy_(state["failures"])
 
 
-def _rotation(start: Tensor, end: Tensor) -> Tensor:
-    """Rotation vectors in world coordinates (..., 3) from one orientation to another, (..., 4)."""
+def _rotation_between(start: Tensor, end: Tensor) -> Tensor:
+    """Rotation vectors in world coordinates [rad], (..., 3), that turn one orientation into another, each (..., 4)."""
     return quat_log(quat_multiply(end, quat_conjugate(start)))
 
 
 def _heading(q: Tensor) -> Tensor:
-    """The rotation about the vertical axis by the yaw of q, (..., 4)."""
+    """The rotations about the vertical axis by the yaw of orientations q, both (..., 4)."""
     w, x, y, z = q.unbind(-1)
     half = 0.5 * torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     zero = torch.zeros_like(half)
@@ -349,7 +360,7 @@ def _heading(q: Tensor) -> Tensor:
 
 
 def _from_euler(angles: Tensor) -> Tensor:
-    """The rotation by roll, pitch and yaw [rad], (..., 3) to (..., 4): about x, then y, then z of the world."""
+    """Quaternions (..., 4) of rotations by roll, pitch and yaw [rad], (..., 3): about the world's x, then y, then z."""
     half = 0.5 * angles
     (cr, cp, cy), (sr, sp, sy) = torch.cos(half).unbind(-1), torch.sin(half).unbind(-1)
     return torch.stack(
@@ -363,11 +374,14 @@ def _from_euler(angles: Tensor) -> Tensor:
     )
 
 
-def _place(
+def _pose_in_axes(
     position: Tensor, orientation: Tensor, other_position: Tensor, other_orientation: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Position (..., 3) and the first two columns of the orientation, row by row, (..., 6), of one frame in the axes of
-    another."""
+    """Pose of another frame in the axes of one with this position (..., 3) and orientation (..., 4).
+
+    Returns:
+        Position (..., 3), and the first two columns of the rotation matrix, row by row, (..., 6).
+    """
     into = quat_conjugate(orientation).expand_as(other_orientation)
     w, x, y, z = quat_multiply(into, other_orientation).unbind(-1)
     columns = (

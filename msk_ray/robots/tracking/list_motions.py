@@ -1,4 +1,4 @@
-"""`msk-ray motions`: what motions are there, and can the robot follow them?"""
+"""`msk-ray motions`: lists motions, says what is wrong with them, and draws them."""
 
 import shutil
 import sys
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from msk_ray.robots.tracking.motions import Motion
 
 DESCRIPTION = """\
-List motions of Unitree's G1: their duration, frames, and what is wrong with them (joints beyond their ranges, parts in
-the ground or in other parts). Files that are no motion of this robot are refused, each in one line.
+List motions of Unitree's G1: their duration, number of frames, and what is wrong with them (joints beyond their ranges,
+body parts inside the ground or each other). A file that holds no motion of this robot is refused in one line.
 
-Reads CSV with a frame a line at 30 Hz, as of Unitree's retargeted LAFAN1 (position, quaternion x, y, z, w, 29 joints),
-and NPZ of mjlab's csv_to_npz. Draws a strip with a row for each motion."""
+Files are CSV at 30 Hz with one frame a line, as in Unitree's retargeted LAFAN1 (position, quaternion x, y, z, w, 29
+joint angles), or NPZ from mjlab's csv_to_npz. Also draws a picture with a row of frames for each motion."""
 
 EXAMPLES = """\
   msk-ray motions builtin:squat
@@ -29,7 +29,7 @@ EXAMPLES = """\
   msk-ray motions g1/dance1_subject2.csv --npz mjlab/  # for mjlab, at 50 Hz
   msk-ray motions g1/ --strip none
 
-exit codes: 0 done, 1 a file was refused, 2 there is none."""
+exit codes: 0 done, 1 a file was refused, 2 there is no motion."""
 
 
 def parser() -> Parser:
@@ -37,10 +37,17 @@ def parser() -> Parser:
     p = Parser("msk-ray motions", DESCRIPTION, EXAMPLES)
     p.add_argument("where", metavar="FILE|FOLDER|builtin:NAME", help="the motions")
     p.add_argument(
-        "--strip", default="motions.png", metavar="FILE", help="picture to draw, or none (default: %(default)s)"
+        "--strip",
+        default="motions.png",
+        metavar="FILE",
+        help="picture to draw; none: no picture (default: %(default)s)",
     )
-    p.add_argument("--frames", type=positive, default=8, metavar="N", help="frames in a row (default: %(default)s)")
-    p.add_argument("--npz", type=Path, metavar="DIR", help="also write each as mjlab's csv_to_npz does, at 50 Hz")
+    p.add_argument(
+        "--frames", type=positive, default=8, metavar="N", help="frames in a row of it (default: %(default)s)"
+    )
+    p.add_argument(
+        "--npz", type=Path, metavar="DIR", help="also write each motion as mjlab's csv_to_npz does, at 50 Hz"
+    )
     return p
 
 
@@ -51,20 +58,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     from msk_ray.config import PhysicsConfig
     from msk_ray.robots.tracking.config import G1TrackingSettings
     from msk_ray.robots.tracking.env import G1Tracking
-    from msk_ray.robots.tracking.motions import BUILTIN, Clip, motion_files, read_motion, read_motions, remarks
+    from msk_ray.robots.tracking.motions import Clip, remarks
 
     settings = G1TrackingSettings(name="g1_tracking")
     model = G1Tracking.build_model(settings, PhysicsConfig())
-    motions: list[Motion] = []
-    refused: list[str] = []
-    if args.where.startswith(BUILTIN):
-        motions = read_motions(args.where, model)
-    else:
-        for path in motion_files(args.where):
-            try:
-                motions.append(read_motion(path, model))
-            except ConfigError as error:
-                refused.append(str(error))
+    motions, refusals = _read(args.where, model)
     rows = [
         (motion.name, f"{motion.seconds:.1f}", str(len(motion)), f"{motion.rate:g}", "; ".join(remarks(motion, model)))
         for motion in motions
@@ -72,20 +70,40 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(text_table(("motion", "seconds", "frames", "Hz", "remarks"), rows, shutil.get_terminal_size((160, 24))[0]))
     seconds = sum(motion.seconds for motion in motions)
     print(f"{len(motions)} motions, {seconds:.0f} s ({seconds / 3600.0:.2f} h)")
-    for line in refused:
-        print(f"refused: {line}")
+    for reason in refusals:
+        print(f"refused: {reason}")
     if args.npz is not None:
         make_folder(args.npz)
         for motion in motions:
             Clip.of(motion.at_rate(1.0 / settings.control_timestep), model).save(args.npz / f"{motion.name}.npz")
         print(f"written into {args.npz}")
     if args.strip != "none" and motions:
-        print(_drawn(motions, model, args.frames, Path(args.strip)))
-    return 1 if refused else 0
+        print(_draw(motions, model, args.frames, Path(args.strip)))
+    return 1 if refusals else 0
 
 
-def _drawn(motions: "Sequence[Motion]", model: "mujoco.MjModel", count: int, path: Path) -> str:
-    """Draw a row for each motion; returns what to say of it."""
+def _read(where: str, model: "mujoco.MjModel") -> "tuple[list[Motion], list[str]]":
+    """The motions in a file or folder, or the built-in one, and why other files were refused.
+
+    Raises:
+        ConfigError: there are neither motions nor files.
+    """
+    from msk_ray.robots.tracking.motions import BUILTIN, motion_files, read_motion, read_motions
+
+    if where.startswith(BUILTIN):
+        return read_motions(where, model), []
+    motions: list[Motion] = []
+    refusals: list[str] = []
+    for path in motion_files(where):
+        try:
+            motions.append(read_motion(path, model))
+        except ConfigError as error:
+            refusals.append(str(error))
+    return motions, refusals
+
+
+def _draw(motions: "Sequence[Motion]", model: "mujoco.MjModel", count: int, path: Path) -> str:
+    """Draw a row of `count` frames for each motion; returns a line that says where, or why not."""
     import numpy as np
 
     from msk_ray.visualize.film import grid
@@ -94,10 +112,10 @@ def _drawn(motions: "Sequence[Motion]", model: "mujoco.MjModel", count: int, pat
     images, captions = [], []
     try:
         for motion in motions:
-            shown = np.unique(np.linspace(0, len(motion) - 1, count).round().astype(int))
-            empty = [np.zeros((len(shown), size)) for size in (model.nv, model.na, model.nu)]
-            images.append(list(frames(States(model, motion.qpos[shown], *empty), View(width=240, height=240))))
-            captions.append([f"{frame / motion.rate:.1f} s" for frame in shown])
+            numbers = np.unique(np.linspace(0, len(motion) - 1, count).round().astype(int))
+            zeros = [np.zeros((len(numbers), size)) for size in (model.nv, model.na, model.nu)]
+            images.append(list(frames(States(model, motion.qpos[numbers], *zeros), View(width=240, height=240))))
+            captions.append([f"{number / motion.rate:.1f} s" for number in numbers])
     except DeviceError as error:
         return f"nothing drawn: {error}"
     grid(images, [motion.name for motion in motions], captions).save(path)

@@ -1,8 +1,8 @@
-"""Motions of a robot: read, checked, resampled, cut, mirrored, and with the velocities and frames of its bodies.
+"""Motions of a robot: reads, checks, resamples, cuts and mirrors them, and computes how each body moves.
 
-Velocities are finite differences, as in mjlab's `csv_to_npz`; frames of bodies are those of the step's own kinematics.
+Velocities are finite differences, as in mjlab's `csv_to_npz`; poses of bodies come from the simulation's kinematics.
 
-Axes: F frames, J joints but for the free one, B bodies but for the world.
+Axes: F frames, J joints except the free one, B bodies of the robot.
 """
 
 import math
@@ -23,56 +23,56 @@ from msk_ray.step.adjoint.forward_kinematics import FrameWalk
 Array = NDArray[np.float64]
 
 CSV_RATE: Final = 30.0
-"""Frames per second of CSV files, which do not say it."""
+"""Frames per second of CSV files, which do not say it [1/s]."""
 BUILTIN: Final = "builtin:"
 SUFFIXES: Final = (".csv", ".npz")
-_MOST_BYTES: Final = 2**28
-"""Largest file, and largest content of one, that is read."""
-_FEWEST_FRAMES: Final = 3
-_UNIT: Final = 0.01
-"""Distance of a quaternion's length from 1 with which it is refused."""
-_SLACK: Final = 0.02
-"""Angle beyond a joint's range that is not worth a word [rad]."""
-_OTHER_ORDER: Final = 0.5
-"""Angle beyond a joint's range [rad] that is a sign of another order of joints, if a tenth of the frames have it."""
-_SUNK: Final = 0.03
-"""Depth in the ground, or in another part of the robot, from which it is told [m]."""
-_TOGETHER: Final = 4096
+_MAX_BYTES: Final = 2**28
+"""Largest file that is read, packed or unpacked [B]."""
+_MIN_FRAMES: Final = 3
+_NORM_TOLERANCE: Final = 0.01
+"""Largest deviation of a quaternion's norm from 1 that is not refused."""
+_RANGE_TOLERANCE: Final = 0.02
+"""Largest angle beyond a joint's range that is not reported [rad]."""
+_WRONG_ORDER: Final = 0.5
+"""Angle beyond a joint's range [rad] that, in a tenth of the frames, means that joints are in another order."""
+_DEPTH_TOLERANCE: Final = 0.03
+"""Largest depth in the ground, or in another part of the robot, that is not reported [m]."""
+_BATCH: Final = 4096
 """Frames whose bodies are placed at once."""
-_LOOKED_AT: Final = 5
-"""Contacts are looked for in every fifth frame."""
+_CONTACT_STRIDE: Final = 5
+"""Contacts are looked for in every fifth frame, because that is slow."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Poses of a robot at equal times."""
+    """Poses of a robot at a constant frame rate."""
 
     name: str
     rate: float
     """Frames per second [1/s]."""
     position: Array
-    """Of the base [m], (F, 3)."""
+    """Position of the base [m], (F, 3)."""
     orientation: Array
-    """Of the base, unit quaternions (w, x, y, z), (F, 4)."""
+    """Orientation of the base, unit quaternions (w, x, y, z), (F, 4)."""
     joints: Array
-    """Angles [rad], (F, J)."""
+    """Joint angles [rad], (F, J)."""
 
     def __len__(self) -> int:
         return len(self.position)
 
     @property
     def seconds(self) -> float:
-        """From the first frame to the last [s]."""
+        """Time from the first frame to the last [s]."""
         return (len(self) - 1) / self.rate
 
     @property
     def qpos(self) -> Array:
-        """As MuJoCo's, (F, 7 + J)."""
+        """MuJoCo's `qpos`, (F, 7 + J)."""
         return np.concatenate((self.position, self.orientation, self.joints), axis=1)
 
     def at_rate(self, rate: float) -> "Motion":
-        """The motion with another number of frames per second: positions and angles are interpolated, and orientations
-        turned evenly. As in mjlab, its last frame is left out."""
+        """The motion at another frame rate [1/s], with positions and angles interpolated linearly and orientations
+        spherically. As in mjlab, a motion that is resampled loses its last frame."""
         if math.isclose(rate, self.rate):
             return self
         times = np.arange(0.0, self.seconds, 1.0 / rate)
@@ -80,24 +80,24 @@ class Motion:
         before = np.minimum(place.astype(int), len(self) - 2)
         share = (place - before)[:, None]
 
-        def between(values: Array) -> Array:
+        def interpolated(values: Array) -> Array:
             return (1.0 - share) * values[before] + share * values[before + 1]
 
-        turned = slerp(self.orientation[before], self.orientation[before + 1], share)
-        return Motion(self.name, rate, between(self.position), turned, between(self.joints))
+        orientation = slerp(self.orientation[before], self.orientation[before + 1], share)
+        return Motion(self.name, rate, interpolated(self.position), orientation, interpolated(self.joints))
 
     def cut(self, start: float, end: float) -> "Motion":
-        """The part from one time to another [s].
+        """The part between two times [s].
 
         Raises:
             ConfigError: it has fewer than 3 frames.
         """
         first, last = math.ceil(start * self.rate - 1e-6), math.floor(end * self.rate + 1e-6)
         part = slice(first, last + 1)
-        if len(self.position[part]) < _FEWEST_FRAMES:
+        if len(self.position[part]) < _MIN_FRAMES:
             raise ConfigError(
                 f"env.cut: {self.name} is {self.seconds:.2f} s long, and {start:g} to {end:g} s has fewer than "
-                f"{_FEWEST_FRAMES} frames of it"
+                f"{_MIN_FRAMES} frames of it"
             )
         return replace(self, position=self.position[part], orientation=self.orientation[part], joints=self.joints[part])
 
@@ -105,7 +105,7 @@ class Motion:
         """The motion with left and right exchanged."""
         names = [model.joint(joint).name for joint in range(1, model.njnt)]
         partner = [names.index(_other_side(name)) for name in names]
-        # Turning about the y axis, which is normal to the mirror, looks the same in it.
+        # The y axis is normal to the mirror: turns about it keep their sign, turns about other axes change it.
         signs = np.where(np.abs(model.jnt_axis[1:, 1]) > 0.5, 1.0, -1.0)
         return replace(
             self,
@@ -118,32 +118,32 @@ class Motion:
 
 @dataclass(frozen=True)
 class Clip:
-    """A motion with its velocities and the frames of all bodies, in world coordinates."""
+    """A motion with its joint rates, and with poses and velocities of the robot's bodies in world coordinates."""
 
     motion: Motion
     joint_rates: Array
     """[rad/s], (F, J)."""
     position: Array
-    """[m], (F, B, 3)."""
+    """Positions of the bodies' origins [m], (F, B, 3)."""
     orientation: Array
-    """Unit quaternions (w, x, y, z), (F, B, 4)."""
+    """Orientations of the bodies, unit quaternions (w, x, y, z), (F, B, 4)."""
     velocity: Array
-    """Of the bodies' origins [m/s], (F, B, 3)."""
+    """Velocities of the bodies' origins [m/s], (F, B, 3)."""
     angular_velocity: Array
-    """[rad/s], (F, B, 3)."""
+    """Angular velocities of the bodies [rad/s], (F, B, 3)."""
 
     def __len__(self) -> int:
         return len(self.motion)
 
     @classmethod
     def of(cls, motion: Motion, model: mujoco.MjModel) -> "Clip":
-        """The clip of a motion."""
+        """The clip of a motion of this model's robot."""
         step = 1.0 / motion.rate
         rates, linear = np.gradient(motion.joints, step, axis=0), np.gradient(motion.position, step, axis=0)
-        spin = _spin(motion.orientation, step)
+        angular = _angular_velocity(motion.orientation, step)
         into_base = motion.orientation * (1.0, -1.0, -1.0, -1.0)
-        qvel = np.concatenate((linear, _rotated(into_base, spin), rates), axis=1)
-        return cls(motion, rates, *_frames(model, motion.qpos, qvel))
+        qvel = np.concatenate((linear, _rotated(into_base, angular), rates), axis=1)
+        return cls(motion, rates, *_body_states(model, motion.qpos, qvel))
 
     def save(self, path: Path) -> None:
         """Write the file that mjlab's `csv_to_npz` writes."""
@@ -160,7 +160,7 @@ class Clip:
 
 
 def motion_files(where: str) -> list[Path]:
-    """The files of motions that a path means: itself, or those in a folder, in the order of their names.
+    """The motion file at a path, or the motion files in the folder there, sorted by name.
 
     Raises:
         ConfigError: there are none.
@@ -178,7 +178,7 @@ def motion_files(where: str) -> list[Path]:
 
 
 def read_motions(where: str, model: mujoco.MjModel) -> list[Motion]:
-    """The motions of a file, of a folder, or of a name such as `builtin:squat`, as they are.
+    """The motions in a file or folder, or the built-in one of a name such as `builtin:squat`, at their own frame rates.
 
     Raises:
         ConfigError: there are none, or one is not a motion of this robot.
@@ -193,18 +193,29 @@ def read_motions(where: str, model: mujoco.MjModel) -> list[Motion]:
 
 
 def read_motion(path: Path, model: mujoco.MjModel) -> Motion:
-    """The motion in a file: CSV with a frame a line, as of Unitree's retargeted LAFAN1 (position of the base,
-    quaternion x, y, z, w, angles of the joints in the order of the model), or NPZ as mjlab's `csv_to_npz` writes it.
+    """The motion in a file.
+
+    A CSV file has one frame a line, as in Unitree's retargeted LAFAN1: position of the base, quaternion x, y, z, w, and
+    joint angles in the order of the model. An NPZ file is written by mjlab's `csv_to_npz`.
 
     Raises:
-        ConfigError: it is none of this robot.
+        ConfigError: the file holds no motion of this robot.
     """
     read = {".csv": _read_csv, ".npz": _read_npz}.get(path.suffix)
     if read is None:
         raise ConfigError(f"{path}: a motion is a file .csv or .npz")
-    if path.stat().st_size > _MOST_BYTES:
-        raise ConfigError(f"{path}: larger than {_MOST_BYTES // 2**20} MiB, which no motion is")
+    if path.stat().st_size > _MAX_BYTES:
+        raise ConfigError(f"{path}: larger than {_MAX_BYTES // 2**20} MiB, which no motion is")
     rate, qpos = read(path)
+    _check_poses(path, qpos, model)
+    orientation = qpos[:, 3:7] / np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    motion = Motion(path.stem, rate, qpos[:, :3], orientation, qpos[:, 7:])
+    _check_order(path, motion, model)
+    return motion
+
+
+def _check_poses(path: Path, qpos: Array, model: mujoco.MjModel) -> None:
+    """Raise ConfigError unless the rows of `qpos` are finite poses of this robot with unit quaternions."""
     joints = model.njnt - 1
     if qpos.ndim != 2 or qpos.shape[1] != 7 + joints:
         columns = qpos.shape[-1] if qpos.ndim == 2 else 0
@@ -212,22 +223,18 @@ def read_motion(path: Path, model: mujoco.MjModel) -> Motion:
             f"{path}: {columns} numbers a frame, not {7 + joints}: 3 of the position, 4 of the orientation and "
             f"{joints} joints, from {model.joint(1).name} to {model.joint(joints).name}"
         )
-    if len(qpos) < _FEWEST_FRAMES:
-        raise ConfigError(f"{path}: {len(qpos)} frames; a motion has {_FEWEST_FRAMES} or more")
+    if len(qpos) < _MIN_FRAMES:
+        raise ConfigError(f"{path}: {len(qpos)} frames; a motion has {_MIN_FRAMES} or more")
     if not np.isfinite(qpos).all():
         raise ConfigError(f"{path}: frame {int(np.flatnonzero(~np.isfinite(qpos).all(1))[0])} is not finite")
-    length = np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
-    if (np.abs(length - 1.0) > _UNIT).any():
-        frame = int(np.abs(length - 1.0).argmax())
-        raise ConfigError(
-            f"{path}: columns 4 to 7 of frame {frame} are no unit quaternion (length {length[frame, 0]:.3g})"
-        )
-    motion = Motion(path.stem, rate, qpos[:, :3], qpos[:, 3:7] / length, qpos[:, 7:])
-    _check_order(path, motion, model)
-    return motion
+    norm = np.linalg.norm(qpos[:, 3:7], axis=1)
+    if (np.abs(norm - 1.0) > _NORM_TOLERANCE).any():
+        frame = int(np.abs(norm - 1.0).argmax())
+        raise ConfigError(f"{path}: columns 4 to 7 of frame {frame} are no unit quaternion (length {norm[frame]:.3g})")
 
 
 def _read_csv(path: Path) -> tuple[float, Array]:
+    """Frame rate [1/s] and rows of a CSV file in the order of `qpos`."""
     try:
         rows = np.loadtxt(path, delimiter=",", ndmin=2)
     except (ValueError, UnicodeDecodeError) as error:
@@ -238,10 +245,11 @@ def _read_csv(path: Path) -> tuple[float, Array]:
 
 
 def _read_npz(path: Path) -> tuple[float, Array]:
+    """Frame rate [1/s] and `qpos` of a file of mjlab's `csv_to_npz`."""
     try:
         with zipfile.ZipFile(path) as archive:
-            if sum(member.file_size for member in archive.infolist()) > _MOST_BYTES:
-                raise ConfigError(f"{path}: its content is larger than {_MOST_BYTES // 2**20} MiB, which no motion is")
+            if sum(member.file_size for member in archive.infolist()) > _MAX_BYTES:
+                raise ConfigError(f"{path}: its content is larger than {_MAX_BYTES // 2**20} MiB, which no motion is")
         with np.load(path, allow_pickle=False) as arrays:
             rate = float(np.ravel(arrays["fps"])[0])
             base = [np.asarray(arrays[name], np.float64)[:, 0] for name in ("body_pos_w", "body_quat_w")]
@@ -257,10 +265,11 @@ def _read_npz(path: Path) -> tuple[float, Array]:
 
 
 def _check_order(path: Path, motion: Motion, model: mujoco.MjModel) -> None:
+    """Raise ConfigError if joints seem to be in another order than the model's."""
     excess = beyond_range(motion, model)
-    often = (excess > _OTHER_ORDER).mean(0)
-    if (often > 0.1).any():
-        joint = int(often.argmax())
+    share_of_frames = (excess > _WRONG_ORDER).mean(0)
+    if (share_of_frames > 0.1).any():
+        joint = int(share_of_frames.argmax())
         raise ConfigError(
             f"{path}: column {8 + joint} is up to {excess[:, joint].max():.2g} rad beyond the range of "
             f"{model.joint(joint + 1).name}: joints are in the order of the robot's model, from {model.joint(1).name} "
@@ -275,55 +284,55 @@ def beyond_range(motion: Motion, model: mujoco.MjModel) -> Array:
 
 
 def remarks(motion: Motion, model: mujoco.MjModel) -> list[str]:
-    """What is wrong with a motion that can be followed all the same, one line each."""
-    found = []
+    """What is wrong with a motion that can be followed nevertheless, one line for each fault."""
+    lines = []
     excess = beyond_range(motion, model)
-    if (worst := float(excess.max())) > _SLACK:
+    if (worst := float(excess.max())) > _RANGE_TOLERANCE:
         joint = int(excess.max(0).argmax())
-        share = float((excess > _SLACK).any(1).mean())
-        found.append(f"{model.joint(joint + 1).name} up to {worst:.2f} rad beyond its range, any joint in {share:.0%}")
+        share = float((excess > _RANGE_TOLERANCE).any(1).mean())
+        lines.append(f"{model.joint(joint + 1).name} up to {worst:.2f} rad beyond its range, any joint in {share:.0%}")
     ground, itself = depths(motion, model).T
     for depth, where in ((ground, "the ground"), (itself, "itself")):
-        if (deepest := float(depth.max())) > _SUNK:
-            share = float((depth > _SUNK).mean())
-            found.append(f"up to {100.0 * deepest:.0f} cm in {where}, over {100.0 * _SUNK:.0f} cm in {share:.0%}")
-    return found
+        if (deepest := float(depth.max())) > _DEPTH_TOLERANCE:
+            share, tolerance_cm = float((depth > _DEPTH_TOLERANCE).mean()), 100.0 * _DEPTH_TOLERANCE
+            lines.append(f"up to {100.0 * deepest:.0f} cm in {where}, over {tolerance_cm:.0f} cm in {share:.0%}")
+    return lines
 
 
 def depths(motion: Motion, model: mujoco.MjModel) -> Array:
-    """How deep the robot is in the ground, and parts of it in each other [m], in every fifth frame, (F / 5, 2)."""
+    """Depth of the robot in the ground, and of its parts in each other [m], in every fifth frame, (F / 5, 2)."""
     data = mujoco.MjData(model)
-    fixed = model.body_weldid[model.geom_bodyid] == 0
-    found = []
-    for qpos in motion.qpos[::_LOOKED_AT]:
+    is_ground = model.body_weldid[model.geom_bodyid] == 0
+    deepest = []
+    for qpos in motion.qpos[::_CONTACT_STRIDE]:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         contact = data.contact
-        on_ground = fixed[contact.geom].any(-1) if data.ncon else np.zeros(0, bool)
-        found.append([max((0.0, *(-contact.dist[chosen]))) for chosen in (on_ground, ~on_ground)])
-    return np.array(found)
+        on_ground = is_ground[contact.geom].any(-1) if data.ncon else np.zeros(0, bool)
+        deepest.append([max((0.0, *(-contact.dist[chosen]))) for chosen in (on_ground, ~on_ground)])
+    return np.array(deepest)
 
 
 def slerp(start: Array, end: Array, share: Array) -> Array:
-    """Unit quaternions (F, 4) at shares (F, 1) of the shorter way from one to another."""
+    """Unit quaternions (F, 4) interpolated spherically along the shorter arc, at shares (F, 1) of it."""
     cosine = (start * end).sum(-1, keepdims=True)
     end, cosine = np.where(cosine < 0.0, -end, end), np.abs(cosine)
     angle = np.arccos(np.minimum(cosine, 1.0))
     sine = np.sin(angle)
-    close = sine < 1e-8
-    safe = np.where(close, 1.0, sine)
-    first = np.where(close, 1.0 - share, np.sin((1.0 - share) * angle) / safe)
-    second = np.where(close, share, np.sin(share * angle) / safe)
-    turned = first * start + second * end
-    unit: Array = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+    is_small = sine < 1e-8
+    safe_sine = np.where(is_small, 1.0, sine)
+    start_weight = np.where(is_small, 1.0 - share, np.sin((1.0 - share) * angle) / safe_sine)
+    end_weight = np.where(is_small, share, np.sin(share * angle) / safe_sine)
+    between = start_weight * start + end_weight * end
+    unit: Array = between / np.linalg.norm(between, axis=-1, keepdims=True)
     return unit
 
 
-def _spin(orientation: Array, step: float) -> Array:
-    """Angular velocity in world coordinates [rad/s], (F, 3), from the frames before and after; at both ends that of the
-    neighbour."""
-    turn = _product(orientation[2:], orientation[:-2] * (1.0, -1.0, -1.0, -1.0))
+def _angular_velocity(orientation: Array, step: float) -> Array:
+    """Angular velocity in world coordinates [rad/s], (F, 3), by central differences over frames `step` seconds apart;
+    the first and last frame have their neighbour's."""
+    turn = _quat_product(orientation[2:], orientation[:-2] * (1.0, -1.0, -1.0, -1.0))
     turn = np.where(turn[:, :1] < 0.0, -turn, turn)
     sine = np.linalg.norm(turn[:, 1:], axis=-1, keepdims=True)
     scale = np.where(sine > 1e-9, 2.0 * np.arctan2(sine, turn[:, :1]) / np.maximum(sine, 1e-9), 2.0)
@@ -331,7 +340,8 @@ def _spin(orientation: Array, step: float) -> Array:
     return np.concatenate((spin[:1], spin, spin[-1:]))
 
 
-def _product(a: Array, b: Array) -> Array:
+def _quat_product(a: Array, b: Array) -> Array:
+    """Products of quaternions (w, x, y, z), (F, 4)."""
     (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
     return np.stack(
         (
@@ -345,47 +355,49 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _rotated(orientation: Array, vector: Array) -> Array:
+    """Vectors (F, 3) turned by unit quaternions (w, x, y, z), (F, 4)."""
     twice = 2.0 * np.cross(orientation[:, 1:], vector)
     turned: Array = vector + orientation[:, :1] * twice + np.cross(orientation[:, 1:], twice)
     return turned
 
 
-def _frames(model: mujoco.MjModel, qpos: Array, qvel: Array) -> tuple[Array, Array, Array, Array]:
-    """Positions, orientations, velocities and angular velocities of the robot's bodies, each (F, B, ·)."""
-    walk = FrameWalk(model, _TOGETHER, wp.get_device())
-    rows = [np.zeros((_TOGETHER, size), dtype=np.float32) for size in (model.nq, model.nv)]
-    own = walk.body_frame[_robot_bodies(model)]
-    found = []
-    for first in range(0, len(qpos), _TOGETHER):
-        part = slice(first, first + _TOGETHER)
+def _body_states(model: mujoco.MjModel, qpos: Array, qvel: Array) -> tuple[Array, Array, Array, Array]:
+    """Positions, orientations, velocities and angular velocities of the robot's bodies, as in `Clip`."""
+    walk = FrameWalk(model, _BATCH, wp.get_device())
+    rows = [np.zeros((_BATCH, size), dtype=np.float32) for size in (model.nq, model.nv)]
+    robot_frames = walk.body_frame[_robot_bodies(model)]
+    batches = []
+    for first in range(0, len(qpos), _BATCH):
+        part = slice(first, first + _BATCH)
         count = len(qpos[part])
         for array, row, values in zip((walk.qpos, walk.qvel), rows, (qpos, qvel), strict=True):
             row[:count] = values[part]
             array.assign(row)
         walk.launch_forward()
-        found.append([array.numpy()[:count, own].astype(np.float64) for array in walk.frames])
-    position, orientation, velocity, spin = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return position, np.roll(orientation, 1, axis=-1), velocity, spin  # Warp has (x, y, z, w)
+        batches.append([array.numpy()[:count, robot_frames].astype(np.float64) for array in walk.frames])
+    position, orientation, velocity, angular_velocity = (np.concatenate(parts) for parts in zip(*batches, strict=True))
+    return position, np.roll(orientation, 1, axis=-1), velocity, angular_velocity  # Warp has (x, y, z, w)
 
 
 def _robot_bodies(model: mujoco.MjModel) -> NDArray[np.int64]:
-    """The bodies that move with the free joint, in their order, which is also that of mjlab's files."""
+    """Numbers of the bodies that move with the free joint, (B,), in the model's order, which mjlab's files share."""
     return np.flatnonzero(model.body_rootid == model.jnt_bodyid[0])
 
 
 def body_names(model: mujoco.MjModel) -> list[str]:
-    """Names of the bodies of a clip."""
+    """Names of the robot's bodies, in the order of a clip's axis B."""
     return [model.body(int(body)).name for body in _robot_bodies(model)]
 
 
 def _other_side(name: str) -> str:
+    """The name of the part on the other side of the robot; the same for a part in its middle."""
     if name.startswith("left_"):
         return f"right_{name.removeprefix('left_')}"
     return f"left_{name.removeprefix('right_')}" if name.startswith("right_") else name
 
 
 def _squat(model: mujoco.MjModel) -> Motion:
-    """From the default pose down and up again within 4 s, with the feet in place, swinging arms and a turning waist."""
+    """A squat of 4 s that begins and ends in the default pose: feet stay in place, arms swing and the waist turns."""
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     standing = data.qpos.copy()
@@ -404,9 +416,9 @@ def _squat(model: mujoco.MjModel) -> Motion:
     for joint, shift in shifts.items():
         qpos[:, model.joint(joint).qposadr[0]] += shift
     ankles = [model.body(f"{leg}_ankle_roll_link").id for leg in ("left", "right")]
-    still = _frames(model, qpos, np.zeros((count, model.nv)))[0]
-    first = int(_robot_bodies(model)[0])
-    feet = still[:, [ankle - first for ankle in ankles]].mean(1)
+    positions = _body_states(model, qpos, np.zeros((count, model.nv)))[0]
+    first_body = int(_robot_bodies(model)[0])
+    feet = positions[:, [ankle - first_body for ankle in ankles]].mean(1)
     qpos[:, :3] += feet[0] - feet
     return Motion("squat", CSV_RATE, qpos[:, :3], qpos[:, 3:7], qpos[:, 7:])
 

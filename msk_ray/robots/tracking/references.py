@@ -1,7 +1,7 @@
-"""Clips on the device: what the robot is to do in every frame, and in which frames episodes begin.
+"""Clips on the device: the reference for every frame, and the frames in which episodes begin.
 
-Axes: F frames of all clips, one after the other, C clips, J joints, B tracked bodies, S seconds ("bins") of all clips,
-W worlds, N episodes.
+Axes: F frames of all clips, one clip after the other, C clips, J joints, B tracked bodies, S bins of about a second in
+all clips, W worlds, N episodes.
 """
 
 import math
@@ -18,11 +18,11 @@ from torch import Tensor
 from msk_ray.robots.tracking.config import G1TrackingSettings, Sampling
 from msk_ray.robots.tracking.motions import BUILTIN, Clip, body_names, motion_files, read_motions
 
-_ANYWHERE = 0.1
-"""Share of adaptive starts that are drawn anywhere. mjlab adds 0.1 to the failures of all worlds in a step instead, so
-that its share depends on their number."""
-_NEWEST = 0.001
-"""Share of the newest env step in the mean of failures."""
+_UNIFORM_SHARE = 0.1
+"""Share of adaptive starts that are drawn anywhere. mjlab instead adds 0.1 to the failures that all worlds have in a
+step, so that its share depends on the number of worlds."""
+_NEWEST_WEIGHT = 0.001
+"""Weight of the newest env step in the running mean of failures."""
 
 
 class Library(NamedTuple):
@@ -39,24 +39,26 @@ class Library(NamedTuple):
 
 @dataclass(frozen=True)
 class Source:
-    """What a library is made of."""
+    """What a library is made from; equal sources give equal libraries."""
 
     motion: str
-    """As `env.motion`."""
+    """As in `env.motion`."""
     model: mujoco.MjModel = field(compare=False)
-    """The robot's."""
+    """The model of the robot."""
     rate: float
-    """Frames per second."""
+    """Frames per second [1/s]."""
     bodies: tuple[str, ...]
-    """The tracked ones, B of them."""
+    """Names of the B tracked bodies."""
     cut: tuple[float, float] | None
+    """As in `env.cut`."""
     mirror: bool
+    """As in `env.mirror`."""
     state: tuple[object, ...]
-    """What else changes a library: files with the times of their last change, and a digest of the model."""
+    """What changes a library besides: a digest of the model, and the files with the times of their last change."""
 
     @classmethod
     def of(cls, settings: G1TrackingSettings, model: mujoco.MjModel, bodies: tuple[str, ...]) -> Self:
-        """That of an environment's settings."""
+        """The source that an environment's settings name."""
         buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, buffer)
         files = [] if settings.motion.startswith(BUILTIN) else motion_files(settings.motion)
@@ -67,38 +69,43 @@ class Source:
 
 @lru_cache(maxsize=1)
 def library_of(source: Source) -> Library:
-    """The library; kept for the next environment of a trial, such as that of its evaluations.
+    """The library made from a source. It is kept for the next environment of the trial, such as the evaluator's.
 
     Raises:
         ConfigError: there are no motions, or one is not of this robot.
     """
-    known = body_names(source.model)
-    tracked = [known.index(body) for body in source.bodies]
+    robot_bodies = body_names(source.model)
+    tracked = [robot_bodies.index(body) for body in source.bodies]
     clips = []
     for motion in read_motions(source.motion, source.model):
         whole = motion.at_rate(source.rate)
         part = whole if source.cut is None else whole.cut(*source.cut)
-        for each in (part, part.mirrored(source.model)) if source.mirror else (part,):
-            clips.append(_tables(Clip.of(each, source.model), tracked))
-    names, joints, frames = zip(*clips, strict=True)
+        for followed in (part, part.mirrored(source.model)) if source.mirror else (part,):
+            clips.append(_tables(Clip.of(followed, source.model), tracked))
+    names, joints, bodies = zip(*clips, strict=True)
     lengths = tuple(map(len, joints))
-    return Library(names, lengths, torch.from_numpy(np.concatenate(joints)), torch.from_numpy(np.concatenate(frames)))
+    return Library(names, lengths, torch.from_numpy(np.concatenate(joints)), torch.from_numpy(np.concatenate(bodies)))
 
 
 def _tables(clip: Clip, tracked: list[int]) -> tuple[str, np.ndarray, np.ndarray]:
+    """Name of a clip, and its rows of `Library.joints` and `Library.bodies`, float32."""
     joints = np.concatenate((clip.motion.joints, clip.joint_rates), axis=1)
     parts = (clip.position, clip.orientation, clip.velocity, clip.angular_velocity)
-    frames = np.concatenate([part[:, tracked] for part in parts], axis=-1)
-    return clip.motion.name, joints.astype(np.float32), frames.astype(np.float32)
+    bodies = np.concatenate([part[:, tracked] for part in parts], axis=-1)
+    return clip.motion.name, joints.astype(np.float32), bodies.astype(np.float32)
 
 
 class Reference(NamedTuple):
-    """What tracked bodies are to do, (W, B, ·), in world coordinates."""
+    """Where the tracked bodies should be and how they should move, in world coordinates."""
 
     position: Tensor
+    """[m], (W, B, 3)."""
     orientation: Tensor
+    """Unit quaternions (w, x, y, z), (W, B, 4)."""
     velocity: Tensor
+    """[m/s], (W, B, 3)."""
     angular_velocity: Tensor
+    """[rad/s], (W, B, 3)."""
 
 
 class References:
@@ -107,11 +114,11 @@ class References:
     Args:
         library: the clips.
         anchor: number of the anchor among the tracked bodies.
-        device: where they are.
+        device: where the tables are.
 
     Attributes:
-        names, lengths: of the clips.
-        firsts, lasts: numbers of their first and last frames, (C,) int64.
+        names, lengths: as in the library.
+        firsts, lasts: numbers of the first and last frame of each clip, (C,) int64.
     """
 
     def __init__(self, library: Library, anchor: int, device: torch.device) -> None:
@@ -124,23 +131,23 @@ class References:
         self._anchor = library.bodies[:, anchor, :7].contiguous().to(device)
 
     def joints(self, frame: Tensor) -> Tensor:
-        """Angles, then rates of the joints in frames (W,), (W, 2 J)."""
+        """Joint angles [rad], then rates [rad/s], in frames (W,), (W, 2 J)."""
         return self._joints.index_select(0, frame)
 
     def anchor(self, frame: Tensor) -> Tensor:
-        """Position and orientation of the anchor in frames (W,), (W, 7)."""
+        """Position [m] and orientation of the anchor in frames (W,), (W, 7)."""
         return self._anchor.index_select(0, frame)
 
     def bodies(self, frame: Tensor) -> Reference:
-        """Tracked bodies in frames (W,)."""
+        """The tracked bodies in frames (W,)."""
         return Reference(*self._bodies.index_select(0, frame).unflatten(1, (-1, 13)).split((3, 4, 3, 3), dim=-1))
 
 
 class StartFrames:
     """Draws the frames in which episodes begin.
 
-    Clips are cut into seconds. An adaptive draw prefers those in which episodes have failed: mean failures per env step
-    are kept in a tensor that is changed in place, so that recorded epochs count too.
+    Clips are divided into bins of about a second. An adaptive draw prefers bins in which episodes have failed. Failures
+    are averaged in a tensor that is changed in place, so that epochs recorded as CUDA graphs count too.
 
     Args:
         references: the clips.
@@ -148,7 +155,7 @@ class StartFrames:
         sampling: how to draw.
 
     Attributes:
-        failures: in each second, per env step, (S,).
+        failures: running mean of the failures in each bin per env step, (S,).
     """
 
     def __init__(self, references: References, rate: float, sampling: Sampling) -> None:
@@ -157,46 +164,50 @@ class StartFrames:
         self._references = references
         counts = [math.floor(length / rate) + 1 for length in references.lengths]
         clip = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts))
-        of_clip = torch.tensor(counts)[clip]
-        number = torch.cat([torch.arange(count) for count in counts])
+        bins_of_clip = torch.tensor(counts)[clip]
+        place_in_clip = torch.cat([torch.arange(count) for count in counts])
         length = torch.tensor(references.lengths)[clip]
         self._clip = clip.to(device)
-        self._width = ((length - 1) / of_clip).float().to(device)
-        self._begin = (number * (length - 1) / of_clip).float().to(device)
-        firsts = np.cumsum([0, *counts[:-1]])
-        frames = [
+        self._width = ((length - 1) / bins_of_clip).float().to(device)
+        self._begin = (place_in_clip * (length - 1) / bins_of_clip).float().to(device)
+        first_bins = np.cumsum([0, *counts[:-1]])
+        bins_of_frames = [
             first + np.arange(length) * count // length
-            for first, count, length in zip(firsts, counts, references.lengths, strict=True)
+            for first, count, length in zip(first_bins, counts, references.lengths, strict=True)
         ]
-        self._bin_of = torch.from_numpy(np.concatenate(frames)).to(device)
+        self._bin_of_frame = torch.from_numpy(np.concatenate(bins_of_frames)).to(device)
         self._share = (self._width / self._width.sum()).to(device)
         self.failures = torch.zeros(len(clip), device=device)
 
     def chances(self) -> Tensor:
-        """The chance of each second, (S,)."""
+        """The probability that an episode begins in each bin, (S,)."""
         if self._sampling != "adaptive":
             return self._share
         total = self.failures.sum()
-        preferred = _ANYWHERE * self._share + (1.0 - _ANYWHERE) * self.failures / total.clamp_min(1e-12)
+        preferred = _UNIFORM_SHARE * self._share + (1.0 - _UNIFORM_SHARE) * self.failures / total.clamp_min(1e-12)
         return torch.where(total > 0.0, preferred, self._share)
 
     def draw(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
-        """First and last frames of episodes, each (N,) int64, from uniform numbers in [0, 1), (N, 2)."""
+        """First frames of N episodes and last frames of their clips, each (N,) int64.
+
+        Args:
+            uniform: random numbers in [0, 1), (N, 2).
+        """
         if self._sampling == "start":
             raise AssertionError("episodes that begin with a clip are not drawn")
         chances = self.chances().cumsum(0)
-        second = torch.searchsorted(chances / chances[-1], uniform[:, 0].contiguous(), right=True)
-        second = second.clamp_max(len(chances) - 1)
-        clip = self._clip[second]
-        within = (self._begin[second] + self._width[second] * uniform[:, 1]).long()
+        drawn_bin = torch.searchsorted(chances / chances[-1], uniform[:, 0].contiguous(), right=True)
+        drawn_bin = drawn_bin.clamp_max(len(chances) - 1)
+        clip = self._clip[drawn_bin]
+        within = (self._begin[drawn_bin] + self._width[drawn_bin] * uniform[:, 1]).long()
         return self._references.firsts[clip] + within, self._references.lasts[clip]
 
     @torch.no_grad()
     def failed_in(self, frame: Tensor, failed: Tensor) -> Tensor:
-        """How many worlds have failed in each second, (S,), in frames (W,), by (W,) bool."""
-        return torch.zeros_like(self.failures).index_add_(0, self._bin_of[frame], failed.float())
+        """Number of failures in each bin, (S,), in worlds at frames (W,) that have `failed` or not, (W,) bool."""
+        return torch.zeros_like(self.failures).index_add_(0, self._bin_of_frame[frame], failed.float())
 
     @torch.no_grad()
     def count(self, failed: Tensor) -> None:
-        """Add an env step's failures (S,) to the mean."""
-        self.failures.lerp_(failed, _NEWEST)
+        """Add the failures of an env step, (S,), to the running mean."""
+        self.failures.lerp_(failed, _NEWEST_WEIGHT)

@@ -1,6 +1,6 @@
 """The reward terms of the tracking task, under mjlab's names.
 
-Each gives a value (W,) for the `state` that a step has led to. The reference is that of the state in which the step
+Each gives a value (W,) for the `state` that a step led to, compared with the reference of the state in which the step
 began, as in mjlab. Source: `tasks/tracking/mdp/rewards.py` of mjlab 1.6.0.
 
 Axes: W worlds, B tracked bodies.
@@ -14,7 +14,7 @@ from msk_ray.step import StepState
 
 
 def _close(env: G1Tracking, difference: Tensor, spread: float) -> Tensor:
-    """exp(−mean over the bodies of |difference|² / spread²), of one, (W, 3), or several, (W, B, 3)."""
+    """exp(−mean over bodies of |difference|² / spread²), (W,), for one body, (W, 3), or several, (W, B, 3)."""
     square = difference.square().sum(-1)
     mean = square.mean(-1) if square.dim() > 1 else square
     return closeness(mean / spread**2, env.config.reward.tail)
@@ -31,7 +31,7 @@ def motion_global_root_ori(env: G1Tracking, state: StepState, action: Tensor, ob
 
 
 def motion_body_pos(env: G1Tracking, state: StepState, action: Tensor, obs: Tensor) -> Tensor:
-    """Closeness of the bodies' positions to the reference moved to the robot, spread 0.3 m."""
+    """Closeness of the bodies' positions to the reference moved to the robot's anchor, spread 0.3 m."""
     return _close(env, env.deviation(state).position, 0.3)
 
 

@@ -1,10 +1,11 @@
-"""`msk-ray track`: how well does a policy follow each clip?"""
+"""`msk-ray track`: scores of a policy on each clip."""
 
 import csv
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.compiling import announce_compiling
@@ -15,11 +16,14 @@ from msk_ray.progress import Pace
 from msk_ray.shipped import is_shipped
 from msk_ray.text_table import text_table
 
+if TYPE_CHECKING:
+    from msk_ray.robots.tracking.clip_scores import ClipScore
+
 DESCRIPTION = """\
-Let a policy of g1_tracking follow each clip once, from its first frame, without noise. A clip fails where the pelvis is
-off by more than 0.25 m in height, or by 0.8 in the vertical part of the direction of gravity in its axes; nothing is
-earned afterwards. Returns are divided by their greatest value. Writes clips.csv, one row a clip, and clips.json into
-the trial's folder or that of --out."""
+Let a policy of g1_tracking follow each clip once, from its first frame and without noise. A clip fails when the pelvis
+is off by more than 0.25 m in height, or by 0.8 in the vertical component of gravity in its axes; a failed clip earns
+nothing more. Returns are divided by the largest possible return. Writes clips.csv, with a row for each clip, and
+clips.json into the trial's folder, or into --out."""
 
 EXAMPLES = """\
   msk-ray track runs/train/g1_tracking_seed0
@@ -29,8 +33,12 @@ EXAMPLES = """\
 def parser() -> Parser:
     """The command line."""
     p = Parser("msk-ray track", DESCRIPTION, EXAMPLES)
-    p.add_argument("target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="the policy: itself, or the best one")
-    p.add_argument("--motion", metavar="PATH", help="clips to follow, as env.motion (default: those of its training)")
+    p.add_argument(
+        "target", metavar="CHECKPOINT|TRIAL|EXPERIMENT", help="the policy, or where to take the best one from"
+    )
+    p.add_argument(
+        "--motion", metavar="PATH", help="clips to follow, as in env.motion (default: those it was trained on)"
+    )
     p.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (default: the trial's)")
     p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
     p.add_argument("--storage", **STORAGE)
@@ -53,15 +61,33 @@ def main(argv: Sequence[str] | None = None) -> int:
     scores = follow_clips(
         policy, args.device or default_device(), args.motion, lambda steps: Pace("env steps at most", steps)
     )
-    rows = [asdict(score) for score in scores]
     out = args.out or trial_folder_of(path)
     make_folder(out)
     write_json(out / "clips.json", as_json(scores, policy))
-    with (out / "clips.csv").open("w", newline="") as file:
+    _write_csv(out / "clips.csv", scores)
+    print(_table(scores))
+    overall = totals(scores)
+    print(
+        f"{overall['failed']} of {overall['clips']} failed; return {overall['normalised_return']:.3f} (mean of the "
+        f"clips), {overall['by_time']:.3f} (mean of the frames), {overall['normalised_motion']:.3f} without costs; "
+        f"mpkpe {1000.0 * overall['mpkpe']:.0f} mm, r_mpkpe {1000.0 * overall['r_mpkpe']:.0f} mm"
+    )
+    print(f"written into {out / 'clips.csv'} and {out / 'clips.json'}")
+    return 0
+
+
+def _write_csv(path: Path, scores: "Sequence[ClipScore]") -> None:
+    """Write one row for each clip."""
+    rows = [asdict(score) for score in scores]
+    with path.open("w", newline="") as file:
         table = csv.DictWriter(file, list(rows[0]))
         table.writeheader()
         table.writerows(rows)
-    shown = [
+
+
+def _table(scores: "Sequence[ClipScore]") -> str:
+    """One line for each clip, for a terminal."""
+    rows = [
         (
             *(score.clip, f"{score.seconds:.1f}", "failed" if score.failed else "-", f"{score.followed:.0%}"),
             *(f"{value:.3f}" for value in (score.normalised_return, score.normalised_motion)),
@@ -70,15 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for score in scores
     ]
     header = ("clip", "seconds", "failed", "followed", "return", "motion", "mpkpe [mm]", "r_mpkpe [mm]")
-    print(text_table(header, shown, 160))
-    every = totals(scores)
-    print(
-        f"{every['failed']} of {every['clips']} failed; return {every['normalised_return']:.3f} (mean of the clips), "
-        f"{every['by_time']:.3f} (mean of the frames), {every['normalised_motion']:.3f} without costs; mpkpe "
-        f"{1000.0 * every['mpkpe']:.0f} mm, r_mpkpe {1000.0 * every['r_mpkpe']:.0f} mm"
-    )
-    print(f"written into {out / 'clips.csv'} and {out / 'clips.json'}")
-    return 0
+    return text_table(header, rows, 160)
 
 
 if __name__ == "__main__":

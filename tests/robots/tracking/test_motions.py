@@ -1,4 +1,4 @@
-"""Motions: what is read and refused, resampling, velocities and frames of bodies, mirror images, remarks."""
+"""Motions: files that are read and refused, resampling, poses and velocities of bodies, mirror images, remarks."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +41,7 @@ def test_csv_and_npz_are_read_as_they_were_written(tmp_path: Path, model: mujoco
     assert [motion.name for motion in read_motions(str(tmp_path), model)] == ["squat", "squat"]
 
 
-def test_what_is_no_motion_is_refused_in_one_line(tmp_path: Path, model: mujoco.MjModel, squat: Motion) -> None:
+def test_files_without_a_motion_of_this_robot_are_refused(tmp_path: Path, model: mujoco.MjModel, squat: Motion) -> None:
     def refused(match: str, **changes: np.ndarray) -> None:
         with pytest.raises(ConfigError, match=match):
             read_motion(write_csv(tmp_path / "bad.csv", replace(squat, **changes)), model)
@@ -74,17 +74,17 @@ def test_what_is_no_motion_is_refused_in_one_line(tmp_path: Path, model: mujoco.
 def test_files_that_are_too_large_are_not_read(
     tmp_path: Path, model: mujoco.MjModel, squat: Motion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(motions, "_MOST_BYTES", 2**20)
+    monkeypatch.setattr(motions, "_MAX_BYTES", 2**20)
     write_csv(tmp_path / "long.csv", replace(squat, joints=np.repeat(squat.joints, 1, axis=0)))
     np.savez_compressed(tmp_path / "bomb.npz", fps=np.array([50.0]), joint_pos=np.zeros((2**16, 29)))
     with pytest.raises(ConfigError, match="its content is larger than 1 MiB"):
         read_motion(tmp_path / "bomb.npz", model)
-    monkeypatch.setattr(motions, "_MOST_BYTES", 1000)
+    monkeypatch.setattr(motions, "_MAX_BYTES", 1000)
     with pytest.raises(ConfigError, match="larger than 0 MiB"):
         read_motion(tmp_path / "long.csv", model)
 
 
-def test_resampling_leaves_a_smooth_motion_as_it_is(squat: Motion) -> None:
+def test_resampling_hardly_changes_a_smooth_motion(squat: Motion) -> None:
     faster = squat.at_rate(50.0)
     assert len(faster) == 200  # 4 s without the last frame
     times = np.arange(200) / 50.0
@@ -94,7 +94,7 @@ def test_resampling_leaves_a_smooth_motion_as_it_is(squat: Motion) -> None:
     assert faster.at_rate(50.0) is faster
 
 
-def test_orientations_turn_evenly_and_the_shorter_way() -> None:
+def test_slerp_turns_evenly_along_the_shorter_arc() -> None:
     def about_z(angle: float) -> np.ndarray:
         return np.array([[np.cos(angle / 2.0), 0.0, 0.0, np.sin(angle / 2.0)]])
 
@@ -104,7 +104,7 @@ def test_orientations_turn_evenly_and_the_shorter_way() -> None:
             np.testing.assert_allclose(turned, about_z(start + 0.25 * (end - start)), atol=1e-12)
 
 
-def test_velocities_are_those_of_the_frames_and_frames_those_of_c_mujoco(model: mujoco.MjModel, squat: Motion) -> None:
+def test_body_poses_are_c_mujocos_and_velocities_their_differences(model: mujoco.MjModel, squat: Motion) -> None:
     turning = squat.at_rate(50.0)
     yaw = np.linspace(0.0, 2.0, len(turning))
     spun = np.stack((np.cos(yaw / 2.0), 0.0 * yaw, 0.0 * yaw, np.sin(yaw / 2.0)), axis=-1)
@@ -121,7 +121,7 @@ def test_velocities_are_those_of_the_frames_and_frames_those_of_c_mujoco(model: 
     assert body_names(model)[0] == "pelvis"
 
 
-def test_a_mirror_image_is_seen_in_every_body(model: mujoco.MjModel, squat: Motion) -> None:
+def test_mirroring_a_motion_mirrors_every_body(model: mujoco.MjModel, squat: Motion) -> None:
     clip, image = Clip.of(squat, model), Clip.of(squat.mirrored(model), model)
     names = body_names(model)
     partner = [names.index(motions._other_side(name)) for name in names]
@@ -129,7 +129,7 @@ def test_a_mirror_image_is_seen_in_every_body(model: mujoco.MjModel, squat: Moti
     np.testing.assert_allclose(squat.mirrored(model).mirrored(model).qpos, squat.qpos)
 
 
-def test_a_part_is_cut_out(squat: Motion) -> None:
+def test_cutting_keeps_the_part_between_two_times(squat: Motion) -> None:
     part = squat.cut(1.0, 2.0)
     assert len(part) == 31
     np.testing.assert_array_equal(part.joints[0], squat.joints[30])
@@ -137,7 +137,9 @@ def test_a_part_is_cut_out(squat: Motion) -> None:
         squat.cut(5.0, 6.0)
 
 
-def test_remarks_tell_of_ranges_and_of_the_ground(model: mujoco.MjModel, squat: Motion) -> None:
+def test_remarks_name_joints_out_of_range_and_parts_in_the_ground_or_in_each_other(
+    model: mujoco.MjModel, squat: Motion
+) -> None:
     assert remarks(squat, model) == []
     sunk = replace(squat, position=squat.position - (0.0, 0.0, 0.05))
     (remark,) = remarks(sunk, model)

@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
     return motions
 
 
-def test_motions_are_listed_checked_and_drawn_if_they_can_be(
+def test_motions_are_listed_checked_and_drawn(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def no_display() -> str:
@@ -55,7 +55,7 @@ class Still:
         return lambda obs: torch.zeros(len(obs), 29)
 
 
-def test_each_clip_is_followed_once(folder: Path) -> None:
+def test_follow_clips_scores_each_clip_once(folder: Path) -> None:
     (folder / "none.csv").unlink()
     env = {"name": "g1_tracking", "action_about": "reference", "motion": str(folder), "reward": {"tail": 1.0}}
     config = parse_config({"env": env, "algorithm": {"name": "shac"}})
@@ -84,7 +84,7 @@ def test_totals_are_means_over_clips_and_over_time() -> None:
     assert every["by_time"] == pytest.approx((10.0 * 0.9 + 30.0 * 0.3) / 40.0)
 
 
-def test_the_command_writes_a_row_for_each_clip(
+def test_track_writes_a_row_for_each_clip(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = parse_config({"env": {"name": "g1_tracking", "layout": "no_state_estimation"}})
@@ -107,7 +107,7 @@ def test_the_command_writes_a_row_for_each_clip(
     assert written["clips"][0]["normalised_return"] == 0.3
 
 
-def test_gradients_along_a_motion_are_those_of_float64_differences(tmp_path: Path, root: Path) -> None:
+def test_gradients_along_a_motion_match_float64_differences(tmp_path: Path, root: Path) -> None:
     few = ["--states", "reset", "--horizons", "1", "3", "--worlds", "2", "--directions", "3"]
     assert diagnose([str(root / "configs" / "g1_tracking.yaml"), *few, "--output", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "rows.json").read_text())

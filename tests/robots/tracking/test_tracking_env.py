@@ -1,4 +1,4 @@
-"""The tracking task beyond what mjlab's recorded steps show: starts, ends, sampling, future frames, gradients."""
+"""The tracking task beyond mjlab's recorded steps: starts, ends, sampling of frames, future frames, gradients."""
 
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ def begin_at(env: G1Tracking, frames: list[int]) -> None:
     env.state = env._begun(state)
 
 
-def test_worlds_begin_near_the_frames_of_their_numbers() -> None:
+def test_episodes_begin_near_the_drawn_frames_within_the_noise() -> None:
     env = make(1)
     physics, numbers = env.draw_start(2000)
     first, last = numbers.unbind(-1)
@@ -58,8 +58,8 @@ def test_worlds_begin_near_the_frames_of_their_numbers() -> None:
     assert state.physics.qpos.shape == (50, 36)
 
 
-def test_the_first_state_of_a_motion_is_the_motion() -> None:
-    """Velocities too: those of all bodies, by the kinematics of the step, are the reference's."""
+def test_without_noise_a_world_begins_exactly_on_its_reference() -> None:
+    """Poses and velocities of all bodies, by the kinematics of the simulation, are the reference's."""
     env = make(3, **STILL)
     begin_at(env, [0, 60, 150])
     deviation = env.deviation(env.state.physics)
@@ -68,29 +68,28 @@ def test_the_first_state_of_a_motion_is_the_motion() -> None:
     assert not env.fell(env.state.physics).any()
 
 
-def test_the_reference_goes_on_with_age_and_an_episode_ends_with_its_clip() -> None:
+def test_the_reference_advances_with_age_and_an_episode_ends_with_its_clip() -> None:
     env = make(2, **STILL, action_about="reference")
     begin_at(env, [40, 197])
     for step in range(3):
         assert env.frame().tolist() == [40 + step, 197 + step]
-        found = env.step(torch.zeros(2, 29), auto_reset=False)
-        torch.testing.assert_close(found.obs, env.observation())
-        torch.testing.assert_close(found.obs[0, :58], env.references.joints(torch.tensor([41 + step]))[0])
-        assert found.truncated.tolist() == [False, step == 2]
+        transition = env.step(torch.zeros(2, 29), auto_reset=False)
+        torch.testing.assert_close(transition.obs, env.observation())
+        torch.testing.assert_close(transition.obs[0, :58], env.references.joints(torch.tensor([41 + step]))[0])
+        assert transition.truncated.tolist() == [False, step == 2]
     assert env.frame().tolist() == [43, 199]
 
 
-def test_ages_can_be_spread_without_moving_the_reference() -> None:
+def test_spreading_ages_leaves_the_reference_in_place() -> None:
     env = make(16, **STILL)
     before = env.frame()
     env.spread_ages()
     assert env.state.age.max() > 400
     assert torch.equal(env.frame(), before)
-    found = env.step(torch.zeros(16, 29))
-    assert not found.terminated.any()
+    assert not env.step(torch.zeros(16, 29)).terminated.any()
 
 
-def test_adaptive_starts_follow_failures_within_a_clip() -> None:
+def test_adaptive_starts_prefer_bins_with_failures() -> None:
     lengths = (250, 100)
     library = Library(("a", "b"), lengths, torch.zeros(350, 58), torch.zeros(350, 14, 13))
     references = References(library, 0, torch.device("cpu"))
@@ -101,24 +100,23 @@ def test_adaptive_starts_follow_failures_within_a_clip() -> None:
     assert set(last.tolist()) == {249, 349}
     assert (first <= last).all()
     assert (first < 250).float().mean() == pytest.approx(250 / 350, abs=0.02)
-    # One of two worlds fails in the first frames of clip b: its first second is the one, and no other clip's.
+    # Of two worlds, the one in frame 252, among the first frames of clip b, fails: that is the first bin of b.
     starts.count(starts.failed_in(torch.tensor([252, 10]), torch.tensor([True, False])))
     assert starts.failures.tolist() == pytest.approx([0.0] * 6 + [0.001, 0.0, 0.0])
     chances = starts.chances()
     assert chances.sum() == pytest.approx(1.0)
     assert chances[6] > 0.5
-    # A tenth goes anywhere, by the length of the seconds: 17 of 350 env steps for the last clip's first.
+    # A tenth of the starts goes anywhere: a bin of clip b has a third of its 99 of all 249 + 99 steps between frames.
     assert chances[6] == pytest.approx(0.9 + 0.1 * (99 / 3) / (249 + 99), abs=1e-6)
 
 
-def test_failures_are_counted_in_steps_and_saved() -> None:
+def test_steps_count_failures_and_checkpoints_keep_them() -> None:
     env = make(4, **STILL)
     begin_at(env, [0, 60, 120, 180])
     lying = env.state.physics.qpos.clone()
     lying[1, 2] -= 0.4
     env.state = env.state._replace(physics=env.state.physics._replace(qpos=lying))
-    found = env.step(torch.zeros(4, 29))
-    assert found.terminated.tolist() == [False, True, False, False]
+    assert env.step(torch.zeros(4, 29)).terminated.tolist() == [False, True, False, False]
     assert env.start_frames.failures.nonzero().flatten().tolist() == [1]
     other = make(4, **STILL)
     other.load_state_dict(env.state_dict())
@@ -126,7 +124,7 @@ def test_failures_are_counted_in_steps_and_saved() -> None:
     assert torch.equal(other.frame(), env.frame())
 
 
-def test_scores_are_without_noise_and_a_world_has_a_clip_where_they_begin_with_it(tmp_path: Path) -> None:
+def test_scored_episodes_begin_without_noise_at_the_first_frame_of_a_clip(tmp_path: Path) -> None:
     model = make(1).model
     (motion,) = read_motions("builtin:squat", model)
     for name, end in (("a", 2.0), ("b", 4.0)):
@@ -147,17 +145,14 @@ def test_scores_are_without_noise_and_a_world_has_a_clip_where_they_begin_with_i
     assert mirrored.references.names == ("a", "a mirrored", "b", "b mirrored")
 
 
-def test_an_action_of_zero_can_ask_for_the_reference() -> None:
+def test_an_action_of_zero_about_the_reference_asks_for_its_joint_angles() -> None:
     env = make(1, **STILL, action_about="reference", action_range=2.0)
     begin_at(env, [100])
-    target = torch.empty(29)
-    target[env._joint_of_servo] = env.control(torch.zeros(1, 29))[0]
-    # In the order of joints again.
-    ordered = env.control(torch.zeros(1, 29))[0]
-    expected = env.references.joints(torch.tensor([100]))[:, :29][:, env._joint_of_servo][0]
-    torch.testing.assert_close(ordered, expected)
-    still = env.step(torch.zeros(1, 29), auto_reset=False).terms[0]
-    assert abs(float(still[env.reward_names.index("action_rate_l2")])) < 0.1
+    targets = env.control(torch.zeros(1, 29))[0]
+    reference_angles = env.references.joints(torch.tensor([100]))[0, :29]
+    torch.testing.assert_close(targets, reference_angles[env._joint_of_servo])
+    terms = env.step(torch.zeros(1, 29), auto_reset=False).terms[0]
+    assert abs(float(terms[env.reward_names.index("action_rate_l2")])) < 0.1
 
 
 def test_future_frames_follow_the_rest_of_the_observation() -> None:
@@ -171,7 +166,7 @@ def test_future_frames_follow_the_rest_of_the_observation() -> None:
     torch.testing.assert_close(more[:, 160 + 67 : 160 + 67 + 58], later)
 
 
-def test_a_tail_is_part_of_training_alone() -> None:
+def test_a_tail_adds_a_share_of_the_reciprocal_to_motion_terms() -> None:
     plain, tailed = make(1, **STILL), make(1, **STILL, reward={"tail": 0.5})
     values = []
     for env in (plain, tailed):
@@ -185,14 +180,14 @@ def test_a_tail_is_part_of_training_alone() -> None:
     assert values[1] == pytest.approx(0.5 * np.exp(-4.0) + 0.5 / 5.0, rel=1e-3)
 
 
-def test_settings_that_cannot_be_are_refused() -> None:
+def test_unknown_motions_and_empty_cuts_are_refused() -> None:
     with pytest.raises(ConfigError, match="no motion 'nowhere'"):
         make(1, motion="nowhere")
     with pytest.raises(ValueError, match=r"2 to 1 s is no part of a motion"):
         make(1, cut=(2.0, 1.0))
 
 
-def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
+def test_gradients_of_reward_and_observation_match_finite_differences() -> None:
     env = make(1, **STILL, reward={"tail": 0.5}, future_frames=[2])
     begin_at(env, [60])
     rng = np.random.default_rng(3)
@@ -228,7 +223,7 @@ def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
         assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-2, abs=2e-2)
 
 
-def test_a_step_from_a_frame_has_the_gradient_of_float64_differences() -> None:
+def test_the_gradient_of_a_step_from_a_frame_matches_float64_differences() -> None:
     env = make(1, **STILL)
     physics = env._noisy(torch.tensor([60]))
     qpos, qvel = (part[0].numpy().astype(np.float64) for part in physics[:2])

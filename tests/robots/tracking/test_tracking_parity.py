@@ -83,7 +83,7 @@ def test_actions_and_observations_are_mjlabs(recorded: Recorded) -> None:
     )
 
 
-def test_what_a_robot_cannot_measure_can_be_left_out(recorded: Recorded) -> None:
+def test_the_layout_without_state_estimation_lacks_what_a_robot_cannot_measure(recorded: Recorded) -> None:
     env = make(1, layout="no_state_estimation")
     names = [entry.name for entry in recorded.env.observation_layout()]
     kept = [not name.startswith(("anchor_position", "imu_velocity")) for name in names]
