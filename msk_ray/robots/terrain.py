@@ -37,7 +37,7 @@ _NOISE = (0.02, 0.10)
 _NOISE_STEP = 0.02
 """Random heights are multiples of it."""
 _WAVE = 0.2
-"""Height of the waves in the hardest row, from trough to crest along one axis."""
+"""Height of the waves in the hardest row, from the lowest point to the crest along one axis."""
 _WAVES = 4
 """Number of waves along each axis."""
 _FOOTPRINT = 8
