@@ -250,7 +250,7 @@ class Env(Task[SettingsT]):
         return draw(shape, generator=self.generator, device=self.generator.device).to(self.device)
 
     def enter_epoch(self, epoch: int) -> None:
-        """Be as a training epoch, counted from 0, is to begin."""
+        """Prepare for a training epoch, counted from 0: schedules first, then what the class itself changes."""
         self.apply_schedules(epoch)
         self.begin_epoch(epoch)
 

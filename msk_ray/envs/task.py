@@ -110,8 +110,9 @@ class Task(ABC, Generic[SettingsT]):
         return None
 
     def apply_schedules(self, epoch: int) -> None:
-        """Set, in place, what settings let depend on the epoch: called before `begin_epoch`, so that a class with its
-        own keeps them. A class with such a setting extends it, with `super()`."""
+        """Set, in place, what the settings make a function of the epoch. It is called before `begin_epoch`, so that a
+        class that overrides only that one keeps the schedules. A class with a schedule of its own extends this method
+        and calls `super()`."""
         self.weighted_terms.begin_epoch(self.config, epoch)
 
     def begin_epoch(self, epoch: int) -> None:

@@ -130,8 +130,12 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         return super().reference_settings(config).model_copy(update={"termination_height": 0.0})
 
     def fell(self, state: StepState) -> Tensor:
-        fallen = self.frames(state).axis(self.robot.base, 2)[:, 2] < math.cos(_FALLEN)
+        fallen = self.has_fallen(state)
         return fallen | self.is_low(state) if self.config.termination_height > 0.0 else fallen
+
+    def has_fallen(self, state: StepState) -> Tensor:
+        """Worlds (W,) bool whose episode ends as in mjlab."""
+        return self.frames(state).axis(self.robot.base, 2)[:, 2] < math.cos(_FALLEN)
 
     def is_low(self, state: StepState) -> Tensor:
         """Whether the base is lower than `env.termination_height`, (W,) bool."""

@@ -70,9 +70,8 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
         middle = self._middles[(row * len(self._middles)).long(), torch.bucketize(kind, self._shares_up_to, right=True)]
         return start._replace(qpos=torch.cat((start.qpos[:, :3] + middle, start.qpos[:, 3:]), dim=-1))
 
-    def fell(self, state: StepState) -> Tensor:
-        hit = self.hits(state, self.thighs) > 0
-        return hit | self.is_low(state) if self.config.termination_height > 0.0 else hit
+    def has_fallen(self, state: StepState) -> Tensor:
+        return self.hits(state, self.thighs) > 0
 
     def base_height(self, state: StepState) -> Tensor:
         return self.ground.below(state.qpos[:, None, :3], _REACH)[:, 0]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from policy_gradient import check_chain
+from slopes import check_slopes
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs import make_env
@@ -71,18 +72,7 @@ def test_reward_and_observation_have_the_gradient_of_their_own_values() -> None:
         obs = env.observe(state, action)
         return (obs * weights).sum() + 10.0 * env.reward_terms(state, action, obs).sum()
 
-    inputs = [torch.tensor(p[None], dtype=torch.float32, requires_grad=True) for p in parts]
-    gradients = torch.autograd.grad(value(inputs), inputs)
-    for which, gradient in enumerate(gradients):
-        direction = rng.normal(size=parts[which].shape)
-        ends = []
-        for sign in (1, -1):
-            moved = [torch.tensor(p[None], dtype=torch.float32) for p in parts]
-            moved[which] = moved[which] + sign * 2e-3 * torch.tensor(direction, dtype=torch.float32)
-            with torch.no_grad():
-                ends.append(float(value(moved)))
-        slope = float((gradient[0] * torch.tensor(direction, dtype=torch.float32)).sum())
-        assert slope == pytest.approx((ends[0] - ends[1]) / 4e-3, rel=5e-3, abs=5e-3)
+    check_slopes(value, parts, rng, step=2e-3, rel=5e-3, abs=5e-3, free=False)
 
 
 def test_activation_carries_most_of_the_gradient_across_control_steps() -> None:

@@ -88,10 +88,10 @@ def motion_of(config: Config) -> Iterator[str | None]:
     motions = read_motions(env.motion, model)
     if len(motions) > 1:
         raise ConfigError(f"--in mjlab: it follows one clip, not the {len(motions)} of env.motion {env.motion}")
-    motion = motions[0].at_rate(1.0 / env.control_timestep)
+    motion = motions[0].part(1.0 / env.control_timestep, env.cut)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "motion.npz"
-        Clip.of(motion if env.cut is None else motion.cut(*env.cut), model).save(path)
+        Clip.of(motion, model).save(path)
         yield str(path)
 
 

@@ -13,6 +13,7 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry, each, entries, vector
 from msk_ray.envs.memory import Memory
 from msk_ray.envs.records import EnvState, Transition
+from msk_ray.errors import ConfigError
 from msk_ray.robots.robots import G1
 from msk_ray.robots.servos import ServoEnv
 from msk_ray.robots.tracking.config import TRACKING_TERMS, G1TrackingSettings
@@ -341,9 +342,13 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         return {**super().state_dict(), "failures": self.start_frames.failures.clone()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        if state["failures"].shape != self.start_frames.failures.shape:
+            raise ConfigError(
+                f"env.motion: the motions in {self.config.motion} have changed since this trial was saved: restore "
+                "them, or start another trial"
+            )
         super().load_state_dict(state)
-        if state["failures"].shape == self.start_frames.failures.shape:  # else the motions have changed
-            self.start_frames.failures.copy_(state["failures"])
+        self.start_frames.failures.copy_(state["failures"])
 
 
 def _rotation_between(start: Tensor, end: Tensor) -> Tensor:

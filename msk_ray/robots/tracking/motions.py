@@ -14,11 +14,14 @@ from typing import Final
 
 import mujoco
 import numpy as np
+import torch
 import warp as wp
 from numpy.typing import NDArray
+from torch import Tensor
 
 from msk_ray.errors import ConfigError, brief
 from msk_ray.step.adjoint.forward_kinematics import FrameWalk
+from msk_ray.step.autograd.tangent import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_rotate
 
 Array = NDArray[np.float64]
 
@@ -101,6 +104,15 @@ class Motion:
             )
         return replace(self, position=self.position[part], orientation=self.orientation[part], joints=self.joints[part])
 
+    def part(self, rate: float, cut: tuple[float, float] | None) -> "Motion":
+        """The motion at a frame rate [1/s], from one time to another [s]; None: all of it.
+
+        Raises:
+            ConfigError: as for `cut`.
+        """
+        whole = self.at_rate(rate)
+        return whole if cut is None else whole.cut(*cut)
+
     def mirrored(self, model: mujoco.MjModel) -> "Motion":
         """The motion with left and right exchanged."""
         names = [model.joint(joint).name for joint in range(1, model.njnt)]
@@ -132,17 +144,13 @@ class Clip:
     angular_velocity: Array
     """Angular velocities of the bodies [rad/s], (F, B, 3)."""
 
-    def __len__(self) -> int:
-        return len(self.motion)
-
     @classmethod
     def of(cls, motion: Motion, model: mujoco.MjModel) -> "Clip":
         """The clip of a motion of this model's robot."""
         step = 1.0 / motion.rate
         rates, linear = np.gradient(motion.joints, step, axis=0), np.gradient(motion.position, step, axis=0)
         angular = _angular_velocity(motion.orientation, step)
-        into_base = motion.orientation * (1.0, -1.0, -1.0, -1.0)
-        qvel = np.concatenate((linear, _rotated(into_base, angular), rates), axis=1)
+        qvel = np.concatenate((linear, _into_axes(motion.orientation, angular), rates), axis=1)
         return cls(motion, rates, *_body_states(model, motion.qpos, qvel))
 
     def save(self, path: Path) -> None:
@@ -316,49 +324,27 @@ def depths(motion: Motion, model: mujoco.MjModel) -> Array:
 
 def slerp(start: Array, end: Array, share: Array) -> Array:
     """Unit quaternions (F, 4) interpolated spherically along the shorter arc, at shares (F, 1) of it."""
-    cosine = (start * end).sum(-1, keepdims=True)
-    end, cosine = np.where(cosine < 0.0, -end, end), np.abs(cosine)
-    angle = np.arccos(np.minimum(cosine, 1.0))
-    sine = np.sin(angle)
-    is_small = sine < 1e-8
-    safe_sine = np.where(is_small, 1.0, sine)
-    start_weight = np.where(is_small, 1.0 - share, np.sin((1.0 - share) * angle) / safe_sine)
-    end_weight = np.where(is_small, share, np.sin(share * angle) / safe_sine)
-    between = start_weight * start + end_weight * end
-    unit: Array = between / np.linalg.norm(between, axis=-1, keepdims=True)
-    return unit
+    first = torch.from_numpy(start)
+    turn = quat_log(quat_multiply(quat_conjugate(first), torch.from_numpy(end)))
+    return _array(quat_multiply(first, quat_exp(torch.from_numpy(share) * turn)))
 
 
 def _angular_velocity(orientation: Array, step: float) -> Array:
     """Angular velocity in world coordinates [rad/s], (F, 3), by central differences over frames `step` seconds apart;
     the first and last frame have their neighbour's."""
-    turn = _quat_product(orientation[2:], orientation[:-2] * (1.0, -1.0, -1.0, -1.0))
-    turn = np.where(turn[:, :1] < 0.0, -turn, turn)
-    sine = np.linalg.norm(turn[:, 1:], axis=-1, keepdims=True)
-    scale = np.where(sine > 1e-9, 2.0 * np.arctan2(sine, turn[:, :1]) / np.maximum(sine, 1e-9), 2.0)
-    spin = scale * turn[:, 1:] / (2.0 * step)
+    before, after = torch.from_numpy(orientation[:-2]), torch.from_numpy(orientation[2:])
+    spin = _array(quat_log(quat_multiply(after, quat_conjugate(before)))) / (2.0 * step)
     return np.concatenate((spin[:1], spin, spin[-1:]))
 
 
-def _quat_product(a: Array, b: Array) -> Array:
-    """Products of quaternions (w, x, y, z), (F, 4)."""
-    (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
-    return np.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        axis=-1,
-    )
+def _into_axes(orientation: Array, vector: Array) -> Array:
+    """Vectors (F, 3) in the axes of unit quaternions (w, x, y, z), (F, 4)."""
+    return _array(quat_rotate(quat_conjugate(torch.from_numpy(orientation)), torch.from_numpy(vector)))
 
 
-def _rotated(orientation: Array, vector: Array) -> Array:
-    """Vectors (F, 3) turned by unit quaternions (w, x, y, z), (F, 4)."""
-    twice = 2.0 * np.cross(orientation[:, 1:], vector)
-    turned: Array = vector + orientation[:, :1] * twice + np.cross(orientation[:, 1:], twice)
-    return turned
+def _array(values: Tensor) -> Array:
+    array: Array = values.numpy()
+    return array
 
 
 def _body_states(model: mujoco.MjModel, qpos: Array, qvel: Array) -> tuple[Array, Array, Array, Array]:

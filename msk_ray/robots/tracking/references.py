@@ -78,8 +78,7 @@ def library_of(source: Source) -> Library:
     tracked = [robot_bodies.index(body) for body in source.bodies]
     clips = []
     for motion in read_motions(source.motion, source.model):
-        whole = motion.at_rate(source.rate)
-        part = whole if source.cut is None else whole.cut(*source.cut)
+        part = motion.part(source.rate, source.cut)
         for followed in (part, part.mirrored(source.model)) if source.mirror else (part,):
             clips.append(_tables(Clip.of(followed, source.model), tracked))
     names, joints, bodies = zip(*clips, strict=True)

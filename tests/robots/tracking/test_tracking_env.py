@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from slopes import check_slopes
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
@@ -122,6 +123,9 @@ def test_steps_count_failures_and_checkpoints_keep_them() -> None:
     other.load_state_dict(env.state_dict())
     assert torch.equal(other.start_frames.failures, env.start_frames.failures)
     assert torch.equal(other.frame(), env.frame())
+    saved = {**env.state_dict(), "failures": torch.zeros(7)}
+    with pytest.raises(ConfigError, match="have changed since this trial was saved"):
+        other.load_state_dict(saved)
 
 
 def test_scored_episodes_begin_without_noise_at_the_first_frame_of_a_clip(tmp_path: Path) -> None:
@@ -207,20 +211,7 @@ def test_gradients_of_reward_and_observation_match_finite_differences() -> None:
         remembered = env.next_memory["anchor"].square().sum()
         return (torch.cat((obs, seen), -1) * weights).sum() + env.reward_terms(state, action, obs).sum() + remembered
 
-    inputs = [torch.tensor(p[None], dtype=torch.float32, requires_grad=True) for p in parts]
-    gradients = torch.autograd.grad(value(inputs), inputs)
-    for which, gradient in enumerate(gradients):
-        direction = rng.normal(size=parts[which].shape)
-        if which == 0:
-            direction[3:7] -= parts[0][3:7] * (direction[3:7] @ parts[0][3:7])  # along the sphere of unit quaternions
-        ends = []
-        for sign in (1, -1):
-            moved = [torch.tensor(p[None], dtype=torch.float32) for p in parts]
-            moved[which] = moved[which] + sign * 1e-3 * torch.tensor(direction, dtype=torch.float32)
-            with torch.no_grad():
-                ends.append(float(value(moved)))
-        slope = float((gradient[0] * torch.tensor(direction, dtype=torch.float32)).sum())
-        assert slope == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-2, abs=2e-2)
+    check_slopes(value, parts, rng)
 
 
 def test_the_gradient_of_a_step_from_a_frame_matches_float64_differences() -> None:
