@@ -34,6 +34,8 @@ import worker  # type: ignore[import-not-found]  # noqa: E402
 
 STEPS = 1000
 """Of an episode, 20 s."""
+ERRORS = worker.ERRORS["twist"]
+"""Names of the errors that a velocity task has."""
 
 
 class TimeIsUp(Exception):
@@ -109,19 +111,19 @@ def score(env, errors, policy) -> dict[str, float]:  # type: ignore[no-untyped-d
     obs, _ = env.reset(seed=0)
     worlds = env.num_envs
     running = torch.ones(worlds, dtype=torch.bool, device=env.device)
-    total = dict.fromkeys(("return", "fell", *worker.ERRORS), 0.0)
+    total = dict.fromkeys(("return", "fell", *ERRORS), 0.0)
     steps = 0.0
     for _ in range(STEPS):
         obs, reward, terminated, _, _ = env.step(policy(obs))
         ended = running & terminated
         found = {"return": reward * running, "fell": ended}
         # A world that fell is elsewhere already when errors are measured.
-        found |= {name: errors[name] * (running & ~ended) for name in worker.ERRORS}
+        found |= {name: errors[name] * (running & ~ended) for name in ERRORS}
         for name, value in found.items():
             total[name] += value.sum()
         steps += running.sum()
         running &= ~ended
-    share = {name: steps if name in worker.ERRORS else worlds for name in total}
+    share = {name: steps if name in ERRORS else worlds for name in total}
     return {name: round(float(value / share[name]), 4) for name, value in total.items()}
 
 
