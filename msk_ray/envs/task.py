@@ -182,7 +182,7 @@ class Task(ABC, Generic[SettingsT]):
 
         It is needed in training only, and may contain what no sensor of a robot tells, such as the height of its feet
         or the friction of the floor. SHAC's gradient flows through it: inputs without one, such as contact forces, can
-        take the value's gradient away from the others (lab/robots.md). Called as `observe` is.
+        take the value's gradient away from the others (lab/go1.md). Called as `observe` is.
         """
         return self.observe(state, action)
 
