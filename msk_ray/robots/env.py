@@ -27,7 +27,7 @@ from msk_ray.robots.robots import G1, GO1
 from msk_ray.robots.servos import ServoEnv
 from msk_ray.step import StepState
 from msk_ray.step.autograd.contact_state import AirTime, Contact
-from msk_ray.step.autograd.tangent import quat_conjugate, quat_multiply, quat_rotate
+from msk_ray.step.autograd.tangent import quat_conjugate, quat_multiply, quat_rotate, quat_yaw
 
 AnyVelocitySettings = TypeVar("AnyVelocitySettings", bound=VelocitySettings)
 
@@ -160,8 +160,7 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         """Commanded velocity forward and to the left [m/s], and yaw rate [rad/s], in the current state, (W, 3)."""
         forward, left, turn, heading, *draws = self.command("velocity").unbind(-1)
         stands, goes_ahead, turns = (draw < share for draw, share in zip(draws, _SHARES, strict=True))
-        w, x, y, z = self.state.physics.qpos[:, 3:7].unbind(-1)
-        error = heading - torch.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+        error = heading - quat_yaw(self.state.physics.qpos[:, 3:7])
         error = torch.remainder(error + math.pi, 2.0 * math.pi) - math.pi
         turn_to_heading = (_HEADING_GAIN * error).clamp(*self.command_ranges["velocity"][:, 2])
         forward = torch.where(goes_ahead, forward.abs().clamp_min(_SLOWEST_AHEAD), forward)

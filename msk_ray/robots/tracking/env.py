@@ -19,7 +19,7 @@ from msk_ray.robots.servos import ServoEnv
 from msk_ray.robots.tracking.config import TRACKING_TERMS, G1TrackingSettings
 from msk_ray.robots.tracking.references import Library, Reference, References, Source, StartFrames, library_of
 from msk_ray.step import StepState
-from msk_ray.step.autograd.tangent import quat_conjugate, quat_log, quat_multiply, quat_rotate
+from msk_ray.step.autograd.tangent import quat_conjugate, quat_log, quat_multiply, quat_rotate, quat_yaw
 
 _LARGEST_HEIGHT_ERROR: Final = 0.25
 """Beyond it an episode ends [m]."""
@@ -358,8 +358,7 @@ def _rotation_between(start: Tensor, end: Tensor) -> Tensor:
 
 def _heading(q: Tensor) -> Tensor:
     """The rotations about the vertical axis by the yaw of orientations q, both (..., 4)."""
-    w, x, y, z = q.unbind(-1)
-    half = 0.5 * torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    half = 0.5 * quat_yaw(q)
     zero = torch.zeros_like(half)
     return torch.stack((torch.cos(half), zero, zero, torch.sin(half)), dim=-1)
 

@@ -55,6 +55,12 @@ def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
     return v + w * t + torch.linalg.cross(u, t)
 
 
+def quat_yaw(q: Tensor) -> Tensor:
+    """Angle [rad] in the plane x, y of the x axis turned by q, shape (..., 4) to (...)."""
+    w, x, y, z = q.unbind(-1)
+    return torch.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
 class Tangent:
     """Tangent-space arithmetic for a model: maps joints between qpos (nq) and the tangent space (nv)."""
 

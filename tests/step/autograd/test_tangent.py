@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.step.autograd.tangent import Tangent, quat_exp, quat_log, quat_multiply, quat_rotate
+from msk_ray.step.autograd.tangent import Tangent, quat_exp, quat_log, quat_multiply, quat_rotate, quat_yaw
 
 XML = """
 <mujoco><worldbody>
@@ -98,3 +98,11 @@ def test_a_lifted_gradient_is_that_of_a_function_that_normalises_quaternions(mod
     found = tangent.lift(raw.detach(), tangent.project(qpos, weights))
     assert torch.allclose(found, expected)
     assert torch.allclose(tangent.lift(raw.detach(), tangent.project(raw.detach(), expected)), expected)
+
+
+def test_yaw_is_that_of_the_turned_x_axis() -> None:
+    turn = quat_exp(torch.tensor([[0.0, 0.0, 0.7], [0.0, 0.0, -2.9]], dtype=torch.float64))
+    pitch, roll = quat_exp(torch.tensor([[0.0, 0.4, 0.0], [1.1, 0.0, 0.0]], dtype=torch.float64))
+    tilted = quat_multiply(turn, quat_multiply(pitch.expand(2, 4), roll.expand(2, 4)))
+    torch.testing.assert_close(quat_yaw(tilted), torch.tensor([0.7, -2.9], dtype=torch.float64))
+    torch.testing.assert_close(quat_yaw(-tilted), quat_yaw(tilted))
