@@ -34,8 +34,6 @@ import worker  # type: ignore[import-not-found]  # noqa: E402
 
 STEPS = 1000
 """Of an episode, 20 s."""
-ERRORS = worker.ERRORS["twist"]
-"""Names of the errors that a velocity task has."""
 
 
 class TimeIsUp(Exception):
@@ -111,20 +109,22 @@ def score(env, errors, policy) -> dict[str, float]:  # type: ignore[no-untyped-d
     obs, _ = env.reset(seed=0)
     worlds = env.num_envs
     running = torch.ones(worlds, dtype=torch.bool, device=env.device)
-    total = dict.fromkeys(("return", "fell", *ERRORS), 0.0)
+    an_episode = dict.fromkeys(("return", "fell"), 0.0)
+    a_step: dict[str, float] = {}
     steps = 0.0
     for _ in range(STEPS):
         obs, reward, terminated, _, _ = env.step(policy(obs))
         ended = running & terminated
-        found = {"return": reward * running, "fell": ended}
-        # A world that fell is elsewhere already when errors are measured.
-        found |= {name: errors[name] * (running & ~ended) for name in ERRORS}
-        for name, value in found.items():
-            total[name] += value.sum()
+        an_episode["return"] += (reward * running).sum()
+        an_episode["fell"] += ended.sum()
+        for name, error in errors.items():
+            # A world that fell is elsewhere already when errors are measured.
+            a_step[name] = a_step.get(name, 0.0) + (error * (running & ~ended)).sum()
         steps += running.sum()
         running &= ~ended
-    share = {name: steps if name in ERRORS else worlds for name in total}
-    return {name: round(float(value / share[name]), 4) for name, value in total.items()}
+    means = {name: value / worlds for name, value in an_episode.items()}
+    means |= {name: value / steps for name, value in a_step.items()}
+    return {name: round(float(mean), 4) for name, mean in means.items()}
 
 
 if __name__ == "__main__":

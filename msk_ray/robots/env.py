@@ -71,7 +71,7 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
     ======= ==========================================================================
 
     The critic sees the same without noise and delays. mjlab's critic also sees contacts, forces and air times of the
-    feet, which have no gradient: robots learned more slowly with them (lab/go1.md).
+    feet, which have no gradient: a Go1 learned less with them (lab/go1.md).
 
     An action turns the targets of the servos away from the default pose; see `control`. Actions and joints are in the
     order of the MJCF's joints, not in that of its actuators.
