@@ -36,12 +36,13 @@ class Recording(Generic[T]):
 
     def __init__(self, work: Callable[[], T], stream: torch.cuda.Stream, pool: Any = None) -> None:
         self._graph = torch.cuda.CUDAGraph()
-        # Keep backward passes on this thread, because Warp's current stream is per thread.
+        # Keep backward passes on this thread, because Warp's current stream is per thread. Collect no garbage until
+        # torch's capture has ended: Warp's ends first, and then Warp frees arrays at once, which spoils torch's.
         with (
+            without_collecting(),
             torch.cuda.device(stream.device),
             torch.autograd.set_multithreading_enabled(False),
             torch.cuda.graph(self._graph, pool=pool, stream=stream, capture_error_mode="thread_local"),
-            without_collecting(),
         ):
             own = stream_of(stream.device)
             assert own is not None, f"{stream.device} has no graphs"
