@@ -1,12 +1,13 @@
 """mjlab's own training of a task with its own settings, scored in the same task after given times of wall-clock.
 
-    PYTHON_OF_MJLAB benchmarks/mjlab_ppo.py Mjlab-Velocity-Flat-Unitree-Go1 --minutes 1 2 3 5 --to ppo.json
+    PYTHON_OF_MJLAB benchmarks/mjlab_ppo.py train Mjlab-Velocity-Flat-Unitree-Go1 --minutes 1 2 3 5 --to ppo
+    PYTHON_OF_MJLAB benchmarks/mjlab_ppo.py score ppo
 
 It runs in a Python that has mjlab, which needs another MuJoCo than this package, and imports none of the package but
-one file. Time counts from the start of this process to the end of the iteration in which it is up; scoring comes after
-training and is not counted. Policies are scored as `msk-ray evaluate --in mjlab` does: deterministic, the first episode
-of each world, with mjlab's settings for playing and then with training's pushes and noise. A line is printed for each
-score and the file has all of them.
+one file. `train` writes the policy to the folder at each of the times, which count from the start of this process to
+the end of the iteration in which the time is up. `score`, on this or another machine, plays them as `msk-ray evaluate
+--in mjlab` does: deterministic, the first episode of each world, with mjlab's settings for playing and then with
+training's pushes and noise. It prints a line for each and writes all to scores.json in the folder.
 """
 
 import time
@@ -41,58 +42,54 @@ class TimeIsUp(Exception):
 
 
 def main() -> None:
-    """Train, score and write what the command line asks for."""
+    """Do what the command line asks for."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("task", help="name of a velocity task of mjlab")
-    p.add_argument("--minutes", type=float, nargs="+", default=[1.0, 2.0, 3.0, 5.0], help="when policies are kept")
-    p.add_argument("--worlds", type=int, default=4096, help="mjlab's examples train with 4096")
-    p.add_argument("--seed", type=int, default=0)
-    p.add_argument("--episodes", type=int, default=256, help="of 1000 steps")
     p.add_argument("--device", default="cuda:0")
-    p.add_argument("--to", type=Path, required=True, help="JSON file that is written")
+    commands = p.add_subparsers(required=True)
+    t = commands.add_parser("train", help="train, keeping policies")
+    t.add_argument("task", help="name of a velocity task of mjlab")
+    t.add_argument("--minutes", type=float, nargs="+", default=[1.0, 2.0, 3.0, 5.0], help="when policies are kept")
+    t.add_argument("--worlds", type=int, default=4096, help="mjlab's examples train with 4096")
+    t.add_argument("--seed", type=int, default=0)
+    t.add_argument("--to", type=Path, required=True, help="folder for the policies, not yet there")
+    t.set_defaults(run=train)
+    s = commands.add_parser("score", help="score the policies in a folder")
+    s.add_argument("folder", type=Path)
+    s.add_argument("--episodes", type=int, default=256, help="of 1000 steps")
+    s.set_defaults(run=score)
     args = p.parse_args()
-    policy, kept = train(args)
-    result = {
-        "task": args.task,
-        "seed": args.seed,
-        "worlds": args.worlds,
-        "versions": {name: importlib.metadata.version(name) for name in (*worker.PACKAGES, "rsl-rl-lib")},
-        "device": torch.cuda.get_device_name(args.device) if args.device != "cpu" else "cpu",
-        "scores": [],
-    }
-    for pushed in (False, True):
-        env, errors = worker.task_for_scoring(args.task, pushed, args.episodes, 0, args.device)
-        for state, facts in kept:
-            with torch.inference_mode():  # as in training, or its statistics of observations are refused
-                policy.load_state_dict(state)
-            row = {**facts, "pushed": pushed, **score(env, errors, policy)}
-            result["scores"].append(row)
-            print(json.dumps(row), flush=True)
-            args.to.write_text(json.dumps(result, indent=1))
-        env.close()
-    print(f"Wrote {args.to}")
+    args.run(args)
 
 
-def train(args: argparse.Namespace) -> tuple[torch.nn.Module, list[tuple[dict[str, torch.Tensor], dict[str, float]]]]:
-    """The policy, its states at the times asked for, and when each was."""
-    cfg, agent = load_env_cfg(args.task), load_rl_cfg(args.task)
-    cfg.scene.num_envs, cfg.seed, agent.seed = args.worlds, args.seed, args.seed
+def train(args: argparse.Namespace) -> None:
+    """Train until the last of the times. A line is printed every 25 iterations and for each policy that is kept."""
+    args.to.mkdir(parents=True)
+    cfg = load_env_cfg(args.task)
+    cfg.scene.num_envs, cfg.seed = args.worlds, args.seed
     torch.manual_seed(args.seed)
-    env = RslRlVecEnvWrapper(ManagerBasedRlEnv(cfg, args.device), clip_actions=agent.clip_actions)
-    runner = MjlabOnPolicyRunner(env, asdict(agent), None, args.device)  # no folder: nothing is logged or saved
-    policy = runner.alg.get_policy()
-    waiting, kept = sorted(60.0 * minutes for minutes in args.minutes), []
+    env, runner = runner_in(ManagerBasedRlEnv(cfg, args.device), args.task, args.seed, args.device)
+    waiting = sorted(60.0 * minutes for minutes in args.minutes)
     print(f"{time.monotonic() - BEGIN:.1f} s: training begins", flush=True)
 
     def keep(it: int, **others: object) -> None:
         seconds = time.monotonic() - BEGIN
+        steps = (it + 1) * runner.cfg["num_steps_per_env"] * args.worlds
+        facts = {"seconds": round(seconds, 1), "iterations": it + 1, "env_steps": steps}
+        returns = runner.logger.rewbuffer
+        if it % 25 == 0 and returns:
+            print(json.dumps(facts | {"return_in_training": round(sum(returns) / len(returns), 2)}), flush=True)
         if seconds < waiting[0]:
             return
         waiting.pop(0)
-        steps = (it + 1) * agent.num_steps_per_env * args.worlds
-        facts = {"seconds": round(seconds, 1), "iterations": it + 1, "env_steps": steps}
-        kept.append(({name: value.clone() for name, value in policy.state_dict().items()}, facts))
-        print(json.dumps(facts), flush=True)
+        facts = {
+            "task": args.task,
+            "seed": args.seed,
+            "worlds": args.worlds,
+            "trained_on": device_name(args.device),
+            **facts,
+        }
+        torch.save({"facts": facts, "policy": runner.alg.get_policy().state_dict()}, args.to / f"{it + 1:06d}.pt")
+        print(f"Wrote {args.to}/{it + 1:06d}.pt after {seconds:.0f} s", flush=True)
         if not waiting:
             raise TimeIsUp
 
@@ -100,11 +97,47 @@ def train(args: argparse.Namespace) -> tuple[torch.nn.Module, list[tuple[dict[st
     with contextlib.suppress(TimeIsUp):
         runner.learn(sys.maxsize, init_at_random_ep_len=True)
     env.close()
-    return policy.eval(), kept
+
+
+def runner_in(env, task: str, seed: int, device: str):  # type: ignore[no-untyped-def]
+    """The environment as rsl_rl wants it, and mjlab's trainer in it, which writes no files."""
+    agent = load_rl_cfg(task)
+    agent.seed = seed
+    wrapped = RslRlVecEnvWrapper(env, clip_actions=agent.clip_actions)
+    return wrapped, MjlabOnPolicyRunner(wrapped, asdict(agent), None, device)
+
+
+def score(args: argparse.Namespace) -> None:
+    """Score all policies of the folder, under both settings."""
+    files = sorted(args.folder.glob("*.pt"))
+    if not files:
+        raise SystemExit(f"{args.folder} holds no policies (*.pt); make some with: train TASK --to {args.folder}")
+    kept = [torch.load(file, map_location=args.device, weights_only=True) for file in files]
+    task = kept[0]["facts"]["task"]
+    versions = {name: importlib.metadata.version(name) for name in (*worker.PACKAGES, "rsl-rl-lib")}
+    result = {"versions": versions, "scored_on": device_name(args.device), "episodes": args.episodes, "scores": []}
+    to = args.folder / "scores.json"
+    for pushed in (False, True):
+        unwrapped, errors = worker.task_for_scoring(task, pushed, args.episodes, 0, args.device)
+        env, runner = runner_in(unwrapped, task, 0, args.device)
+        policy = runner.alg.get_policy().eval()
+        for saved in kept:
+            with torch.inference_mode():  # as in training, or its statistics of observations are refused
+                policy.load_state_dict(saved["policy"])
+            row = {**saved["facts"], "pushed": pushed, **means(unwrapped, errors, policy)}
+            result["scores"].append(row)
+            print(json.dumps(row), flush=True)
+            to.write_text(json.dumps(result, indent=1), encoding="utf-8")
+        env.close()
+    print(f"Wrote {to}")
+
+
+def device_name(device: str) -> str:
+    return torch.cuda.get_device_name(device) if device != "cpu" else "cpu"
 
 
 @torch.inference_mode()
-def score(env, errors, policy) -> dict[str, float]:  # type: ignore[no-untyped-def]
+def means(env, errors, policy) -> dict[str, float]:  # type: ignore[no-untyped-def]
     """Means over the first episodes of all worlds."""
     obs, _ = env.reset(seed=0)
     worlds = env.num_envs
