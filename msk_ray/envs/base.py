@@ -20,6 +20,7 @@ from msk_ray.config.commands import Commands
 from msk_ray.envs.commands import DrawnCommands
 from msk_ray.envs.contract import Contract, versions
 from msk_ray.envs.disturbances import Disturbances
+from msk_ray.envs.divergence import diverged_worlds
 from msk_ray.envs.measurements import Measurements
 from msk_ray.envs.memory import Memories, restored
 from msk_ray.envs.options import FUSED_SOLVER, JACOBIANS
@@ -39,9 +40,6 @@ from msk_ray.step.autograd.ground import Ground
 from msk_ray.step.autograd.kinematics import Frames, Names
 from msk_ray.step.autograd.sensors import Readings
 from msk_ray.step.forward.capacity import Capacity
-
-# A world whose state exceeds this bound has diverged: no model here reaches it as long as the solver works.
-_STATE_BOUND = 1e6
 
 
 class Env(Task[SettingsT]):
@@ -266,7 +264,7 @@ class Env(Task[SettingsT]):
         control = self.disturbances.control(self.control(action), self.state)
         force = self.applied_force(before)
         after = self.sim.step(control, *before, qfrc_applied=force, parameters=self.parameters)
-        diverged = ~_is_valid(after)
+        diverged = diverged_worlds(after)
         if not (all_valid := known_none(diverged)):
             # `where` sends no cotangent into a diverged world's step, so its gradient cannot reach the batch.
             after = StepState(*(rows_where(diverged, b.detach(), a) for b, a in zip(before, after, strict=True)))
@@ -444,10 +442,3 @@ class Env(Task[SettingsT]):
         if "capacity" in state:
             # The buffer sizes that the trial had grown to: the next step may need them.
             self.sim.reserve(Capacity(*state["capacity"]))
-
-
-@torch.no_grad()
-def _is_valid(state: StepState) -> Tensor:
-    """Worlds (W,) bool in which the physics is within bounds."""
-    # NaN compares false, so one comparison finds both non-finite values and those out of bounds.
-    return (torch.cat(state, dim=-1).abs() < _STATE_BOUND).all(-1)

@@ -1,4 +1,4 @@
-"""What disturbs a policy in training: errors, delays and kicks, their gradients, scores without them, resumption."""
+"""What disturbs a policy in training: errors, delays and pushes, their gradients, scores without them, resumption."""
 
 import math
 from pathlib import Path
@@ -228,21 +228,21 @@ def test_gradients_flow_through_errors_and_late_observations() -> None:
     assert to_second is None or not to_second.any()
 
 
-def test_kicks_have_the_configured_times_and_sizes() -> None:
-    kicked, plain = (cartpole(256, push=p) if p else cartpole(256) for p in (DISTURBANCES["push"], None))
+def test_pushes_have_the_configured_times_and_sizes() -> None:
+    pushed, plain = (cartpole(256, push=p) if p else cartpole(256) for p in (DISTURBANCES["push"], None))
     sizes, steps = [], []
     for step in range(39):
-        plain.state = plain.state._replace(physics=kicked.state.physics)
-        change = kicked.disturbances.pushed(kicked.state.physics, kicked.state).qvel - kicked.state.physics.qvel
+        plain.state = plain.state._replace(physics=pushed.state.physics)
+        change = pushed.disturbances.pushed(pushed.state.physics, pushed.state).qvel - pushed.state.physics.qvel
         assert not change[:, 1].any()
         if step == 0:
             assert not change.any()
         hit = change[:, 0] != 0.0
         sizes.append(change[hit, 0])
         steps.append(hit)
-        kicked.step(torch.zeros(256, 1))
+        pushed.step(torch.zeros(256, 1))
         plain.step(torch.zeros(256, 1))
-        moved = (kicked.state.physics.qvel != plain.state.physics.qvel).any(-1)
+        moved = (pushed.state.physics.qvel != plain.state.physics.qvel).any(-1)
         assert torch.equal(moved, hit)
     every = torch.cat(sizes)
     assert 0.45 < float(every.abs().max()) <= 0.5
