@@ -13,7 +13,7 @@ from msk_ray.compiling import announce_compiling
 from msk_ray.config import RandomizeConfig
 from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
-from msk_ray.evaluate.elsewhere import SCORINGS, Scorer, find_python, foreign_scoring
+from msk_ray.evaluate.foreign_scoring import SCORINGS, Scorer, find_python, foreign_scoring
 from msk_ray.evaluate.stored import FORMAT, eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import REFERENCE, Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
