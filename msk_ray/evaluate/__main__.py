@@ -18,7 +18,7 @@ from msk_ray.evaluate.stored import FORMAT, eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import REFERENCE, Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
 from msk_ray.experiment.attempts import read_attempt
-from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.checkpoint_format import read_facts
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.trial import by_environment
