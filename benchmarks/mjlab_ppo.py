@@ -31,7 +31,7 @@ from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper  # noqa: E402
 from mjlab.tasks.registry import load_env_cfg, load_rl_cfg  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "msk_ray/robots/mjlab"))
-import worker  # type: ignore[import-not-found]  # noqa: E402
+import mjlab_side  # type: ignore[import-not-found]  # noqa: E402
 
 STEPS = 1000
 """Of an episode, 20 s."""
@@ -114,11 +114,11 @@ def score(args: argparse.Namespace) -> None:
         raise SystemExit(f"{args.folder} holds no policies (*.pt); make some with: train TASK --to {args.folder}")
     kept = [torch.load(file, map_location=args.device, weights_only=True) for file in files]
     task = kept[0]["facts"]["task"]
-    versions = {name: importlib.metadata.version(name) for name in (*worker.PACKAGES, "rsl-rl-lib")}
+    versions = {name: importlib.metadata.version(name) for name in (*mjlab_side.PACKAGES, "rsl-rl-lib")}
     result = {"versions": versions, "scored_on": device_name(args.device), "episodes": args.episodes, "scores": []}
     to = args.folder / "scores.json"
     for pushed in (False, True):
-        unwrapped, errors = worker.task_for_scoring(task, pushed, args.episodes, 0, args.device)
+        unwrapped, errors = mjlab_side.task_for_scoring(task, pushed, args.episodes, 0, args.device)
         env, runner = runner_in(unwrapped, task, 0, args.device)
         policy = runner.alg.get_policy().eval()
         for saved in kept:

@@ -14,7 +14,7 @@ from fault_campaign.reference import Reference
 from fault_campaign.tally import Tally
 from msk_ray.experiment import layout
 from msk_ray.experiment.attempts import Attempt, WorldReduction, load_attempt
-from msk_ray.experiment.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from msk_ray.experiment.checkpoint_format import read_checkpoint_file, write_checkpoint_file
 from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
 from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog

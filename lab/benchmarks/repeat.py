@@ -25,7 +25,7 @@ from pathlib import Path
 from record import RESULTS, markdown_table, publish
 
 from msk_ray.config import read_yaml
-from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.checkpoint_format import read_facts
 from msk_ray.experiment.metrics import read_rows
 
 POLL = 0.05

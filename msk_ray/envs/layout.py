@@ -1,4 +1,5 @@
-"""Names and units of the numbers of an observation."""
+"""The type of an observation's entries, and helpers to list them. Each environment lists its own in
+`observation_layout`."""
 
 from collections.abc import Iterable
 from typing import NamedTuple

@@ -13,12 +13,12 @@ from msk_ray.compiling import announce_compiling
 from msk_ray.config import RandomizeConfig
 from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
-from msk_ray.evaluate.elsewhere import SCORINGS, Scorer, find_python, foreign_scoring
+from msk_ray.evaluate.foreign_scoring import SCORINGS, Scorer, find_python, foreign_scoring
 from msk_ray.evaluate.stored import FORMAT, eval_file_of, store_evaluation
 from msk_ray.evaluate.targets import REFERENCE, Kind, Target, best_checkpoint, best_of_trial, find_target
 from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
 from msk_ray.experiment.attempts import read_attempt
-from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.checkpoint_format import read_facts
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.trial import by_environment

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msk_ray.errors import ConfigError, SimulationError
-from msk_ray.evaluate.elsewhere import ForeignScoring
+from msk_ray.evaluate.foreign_scoring import ForeignScoring
 
 
 class ForeignProcess(AbstractContextManager["ForeignProcess"]):

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from msk_ray.config import describe_fault, read_yaml
 from msk_ray.config.sections import Count, Fraction, NonNegative, Section, Whole
 from msk_ray.errors import MskRayError, StorageError
-from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.checkpoint_format import read_facts
 from msk_ray.text import printable
 
 if TYPE_CHECKING:

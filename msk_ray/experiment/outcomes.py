@@ -34,7 +34,7 @@ class Outcome(StrEnum):
     NONFINITE = "nonfinite"
     """A score, loss or gradient was NaN or infinite."""
     DIVERGED = "diverged"
-    """Too many simulated worlds diverged."""
+    """A step lost contacts or constraint rows. A world that diverges only ends its episode."""
     OUT_OF_MEMORY = "out_of_memory"
     """Its device has less memory than its settings need."""
     ERROR = "error"

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from msk_ray.envs import Env
 from msk_ray.envs.records import EnvState
 from msk_ray.errors import ExportError
-from msk_ray.export.memory import NOISE, carried_memory
+from msk_ray.export.find_memory import NOISE, carried_memory
 from msk_ray.step import StepState
 
 TOLERANCE = 1e-5

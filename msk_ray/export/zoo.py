@@ -16,7 +16,7 @@ from msk_ray.errors import ConfigError, StorageError
 from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.evaluate.targets import REFERENCE, trial_folder_of
 from msk_ray.evaluate.zoo import BEGIN, BEST_EVALUATION, END, MAX_BYTES, Entry, Training, read_zoo, score_of, zoo_text
-from msk_ray.experiment.checkpoint_file import write_checkpoint_file
+from msk_ray.experiment.checkpoint_format import write_checkpoint_file
 from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, best_checkpoint
 from msk_ray.experiment.manifest import Experiment

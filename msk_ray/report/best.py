@@ -11,7 +11,7 @@ from PIL import Image, PngImagePlugin
 from msk_ray.errors import MskRayError
 from msk_ray.evaluate.stored import eval_file_of, read_evaluations, store_evaluation
 from msk_ray.evaluate.targets import best_of_trial
-from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.checkpoint_format import read_facts
 from msk_ray.experiment.layout import EVAL_FILE
 from msk_ray.experiment.records import TrialRecord
 from msk_ray.files import read_file, write_bytes

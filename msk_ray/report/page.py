@@ -22,7 +22,8 @@ from msk_ray.progress import format_duration
 from msk_ray.report.best import Best, strip_bytes
 from msk_ray.report.charts import Picture, format_steps
 from msk_ray.report.curves import gradient_health, learning_curves, stopping_map
-from msk_ray.report.influence import parallel_coordinates, parameter_effects, ranked_effects
+from msk_ray.report.effect_charts import parallel_coordinates, parameter_effects
+from msk_ray.report.effects import ranked_effects
 from msk_ray.report.reading import Condition, Reading
 from msk_ray.report.tables import (
     VariantRow,

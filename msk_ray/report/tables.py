@@ -18,7 +18,7 @@ BASELINE = "baseline"
 
 MEANINGS: dict[str, str] = {
     Outcome.NONFINITE: "a score, loss or gradient was NaN or infinite",
-    Outcome.DIVERGED: "too many simulated worlds diverged, or contacts were lost",
+    Outcome.DIVERGED: "a step lost contacts or constraint rows, so its results were no state",
     Outcome.OUT_OF_MEMORY: "the device has less memory than the settings need",
     Outcome.ERROR: "an exception, or the process died too often",
     State.INTERRUPTED: "begun and not ended, and nothing is running it: --resume continues it",

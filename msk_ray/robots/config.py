@@ -77,6 +77,7 @@ class VelocitySettings(ServoSettings):
 
     episode_length: Count = 1000
     reset_noise: NonNegative = 0.0
+    """Spread of initial positions [m, rad], besides mjlab's of position and heading, which is always there."""
     reset_velocity_noise: NonNegative = 0.0
     termination_height: NonNegative = 0.0
     """In training, episodes also end when the base is lower than this [m], because a robot that has sunk into a crouch

@@ -146,7 +146,8 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
         return state.qpos[:, 2]
 
     def outcome_terms(self, state: StepState) -> dict[str, Tensor]:
-        """`linear_error` [m/s] and `yaw_error` [rad/s]: differences between the base's velocity and the command."""
+        """Differences between the base's velocity and the command, each (W,): `linear_error` [m/s] and `yaw_error`
+        [rad/s], logged as `eval/linear_error` and `eval/yaw_error`."""
         command = self.velocity_command()
         linear, angular = self.base_velocities(state)
         return {

@@ -12,13 +12,12 @@ from msk_ray.envs.layout import Entry, entries
 from msk_ray.robots.config import GO1_ROUGH_TERMS, ROUGH_VELOCITY, Go1VelocityRoughSettings
 from msk_ray.robots.env import VelocityEnv
 from msk_ray.robots.robots import GO1
+from msk_ray.robots.terms import COLLISION_FORCE
 from msk_ray.robots.terrain import KINDS, Terrain
 from msk_ray.step import StepState
 from msk_ray.step.autograd.ground import grid
 from msk_ray.step.autograd.tangent import quat_rotate
 
-_COLLISION_FORCE = 10.0
-"""Force on a thigh, shank, trunk or head from which it counts as hitting the ground [N]."""
 _REACH = 5.0
 """Reach of the scan; the observation divides its readings by it [m]."""
 _RING = 0.04
@@ -47,6 +46,7 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
     thighs = tuple(f"{leg}_thigh_collision{k}" for leg in GO1.feet for k in (1, 2, 3))
     shanks = tuple(f"{leg}_calf_collision{k}" for leg in GO1.feet for k in (1, 2))
     trunk_and_head = ("trunk_collision", "head_collision")
+    scan_points = grid(1.6, 1.0, 0.1)
 
     @classmethod
     def edit(cls, spec: mujoco.MjSpec, config: Go1VelocityRoughSettings, physics: PhysicsConfig) -> None:
@@ -58,7 +58,7 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
         super().prepare()
         self._middles = self.tensor(Terrain(self.config.terrain_rows).starts)
         self._shares_up_to = self.tensor(list(KINDS.values())).cumsum(0)[:-1]
-        self._scanned = grid(1.6, 1.0, 0.1).to(self.device)
+        self._scanned = self.scan_points.to(self.device)
         self._fitted = torch.linspace(0, len(self._scanned) - 1, _FITTED, device=self.device).long()
         self._ahead = self.tensor([1.0, 0.0, 0.0])
 
@@ -81,7 +81,7 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
     def hits(self, state: StepState, geoms: tuple[str, ...]) -> Tensor:
         """Number of substeps in which one of these geoms hit the ground with more than 10 N, (W,)."""
         strongest = self.contact(state, geoms, "geom", "terrain", "body").strongest
-        return (strongest > _COLLISION_FORCE).any(-1).sum(0)
+        return (strongest > COLLISION_FORCE).any(-1).sum(0)
 
     def foot_heights(self, state: StepState) -> Tensor:
         """Heights of the feet above the highest ground around them [m], at least 0, (W, F)."""
@@ -115,8 +115,8 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
         return torch.cat((super().observe(state, action), self.scan(state) / _REACH), dim=-1)
 
     def observation_layout(self) -> list[Entry]:
-        points = grid(1.6, 1.0, 0.1).tolist()
-        return [*super().observation_layout(), *entries((f"scan_{x:+.1f}_{y:+.1f}" for x, y in points), "5 m")]
+        names = (f"scan_{x:+.1f}_{y:+.1f}" for x, y in self.scan_points.tolist())
+        return [*super().observation_layout(), *entries(names, "5 m")]
 
 
 def plane_normal(points: Tensor, up: Tensor) -> Tensor:

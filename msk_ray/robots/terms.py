@@ -30,7 +30,7 @@ _AIR_TIME = 0.05, 0.5
 """Shortest and longest time in the air that `air_time` rewards [s]."""
 _AIR_TIME_SPEED = 0.5
 """Commanded speed above which `air_time` rewards anything, in m/s plus rad/s."""
-_COLLISION_FORCE = 10.0
+COLLISION_FORCE = 10.0
 """Force above which a collision counts [N]."""
 
 
@@ -155,7 +155,7 @@ def self_collisions(env: ServoEnv[Any], state: StepState, action: Tensor, obs: T
     Of the contacts in a substep, mjlab looks at the one that comes first; this term looks at the strongest.
     """
     contact = env.contact(state, env.robot.base, "subtree", env.robot.base, "subtree")
-    return (contact.strongest[..., 0] > _COLLISION_FORCE).sum(0).float()
+    return (contact.strongest[..., 0] > COLLISION_FORCE).sum(0).float()
 
 
 def shank_collision(env: "Go1VelocityRough", state: StepState, action: Tensor, obs: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ class Failure(StrEnum):
     """How a simulation can fail; a trial's outcome gets the same name."""
 
     DIVERGED = "diverged"
-    """Worlds diverged, or contacts or constraint rows were lost."""
+    """In training, a step lost contacts or constraint rows; elsewhere, any other failure."""
     NONFINITE = "nonfinite"
     """A gradient was NaN or infinite."""
     OUT_OF_MEMORY = "out_of_memory"

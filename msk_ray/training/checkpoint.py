@@ -1,4 +1,7 @@
-"""Checkpoints, which are either complete or absent: PyTorch states in files with checksums."""
+"""A trial's checkpoints: writing, reading, and choosing the newest usable one.
+
+Each is a PyTorch state in a file with checksums (`experiment/checkpoint_format.py`), complete or absent.
+"""
 
 import io
 import re
@@ -8,7 +11,7 @@ from typing import Any
 import torch
 
 from msk_ray.errors import CheckpointError
-from msk_ray.experiment.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from msk_ray.experiment.checkpoint_format import read_checkpoint_file, write_checkpoint_file
 from msk_ray.networks import parameter_hash
 
 _EPOCH_NAME = re.compile(r"epoch_(\d+)\.pt")

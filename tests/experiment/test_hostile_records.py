@@ -21,7 +21,7 @@ from msk_ray.errors import CheckpointError, MskRayError
 from msk_ray.evaluate.stored import read_evaluations
 from msk_ray.experiment import layout
 from msk_ray.experiment.attempts import Attempt, WorldReduction
-from msk_ray.experiment.checkpoint_file import read_checkpoint_file, read_facts, write_checkpoint_file
+from msk_ray.experiment.checkpoint_format import read_checkpoint_file, read_facts, write_checkpoint_file
 from msk_ray.experiment.damage import CATALOGUE, DEPTH, LINE, read_object
 from msk_ray.experiment.manifest import MAX_TRIALS, Experiment
 from msk_ray.experiment.metrics import load_metrics

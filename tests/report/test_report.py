@@ -25,7 +25,7 @@ from msk_ray.experiment.records import ExperimentReader, TrialRecord
 from msk_ray.report.__main__ import main
 from msk_ray.report.charts import Floor, Picture, Plot, thin_evenly
 from msk_ray.report.curves import curve_over, learning_curves, rung_steps
-from msk_ray.report.influence import ranked_effects
+from msk_ray.report.effects import ranked_effects
 from msk_ray.report.page import _templates, make_section, places_of
 from msk_ray.report.reading import Condition, read_again, read_experiment
 from msk_ray.report.tables import failures, outcome_figures, variant_rows

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from msk_ray.errors import CheckpointError
-from msk_ray.experiment.checkpoint_file import write_checkpoint_file
+from msk_ray.experiment.checkpoint_format import write_checkpoint_file
 from msk_ray.training.checkpoint import (
     epoch_checkpoints,
     newest_valid_checkpoint,

@@ -11,7 +11,7 @@ import torch
 
 from msk_ray.config import Config, parse_config
 from msk_ray.errors import CheckpointError
-from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.checkpoint_format import read_facts
 from msk_ray.networks import as_number, parameter_hash
 from msk_ray.training import Trainer, read_metrics
 from msk_ray.training.checkpoint import read_checkpoint, write_checkpoint

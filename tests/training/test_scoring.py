@@ -14,7 +14,7 @@ from msk_ray.algorithms import algorithm_class
 from msk_ray.cli import run
 from msk_ray.config import Config, dump_yaml, load_config, overlay, parse_config
 from msk_ray.errors import Failure, SimulationError, StorageFailure
-from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.checkpoint_format import read_facts
 from msk_ray.train import main
 from msk_ray.training import Evaluator, Trainer, read_metrics
 from msk_ray.training.checkpoint import milestones, read_checkpoint, unscored_checkpoints

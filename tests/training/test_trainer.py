@@ -20,7 +20,7 @@ from processes import Launcher, catches, wait_until
 from msk_ray.cli import run
 from msk_ray.config import Config, parse_config
 from msk_ray.errors import CheckpointError, StorageFailure
-from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.checkpoint_format import read_facts
 from msk_ray.train import main
 from msk_ray.training import Trainer, precompile, read_metrics
 from msk_ray.training.checkpoint import epoch_checkpoints, milestones, read_checkpoint, write_checkpoint

@@ -14,7 +14,7 @@ import pytest
 from stub_trainer import BEHAVIOUR, BROKEN_CONNECTION, BUG, EXIT, EXIT_ZERO, INTERRUPT, StubTrainer
 
 from msk_ray.config import Config
-from msk_ray.experiment.checkpoint_file import read_facts
+from msk_ray.experiment.checkpoint_format import read_facts
 from msk_ray.experiment.layout import OUTCOME_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending

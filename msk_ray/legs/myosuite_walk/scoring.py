@@ -15,9 +15,9 @@ from msk_ray.config import Config
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.foreign_process import ForeignProcess
 from msk_ray.evaluate.measure import EvaluationSetup, Request, entry_of
-from msk_ray.legs.myosuite_walk import scoring_worker as worker
+from msk_ray.legs.myosuite_walk import myosuite_side
 from msk_ray.legs.myosuite_walk.config import MyoSuiteWalkSettings
-from msk_ray.legs.myosuite_walk.elsewhere import MYOSUITE
+from msk_ray.legs.myosuite_walk.declaration import MYOSUITE
 from msk_ray.legs.myosuite_walk.mirror import WalkMirror
 from msk_ray.legs.myosuite_walk.model import build_myosuite_walk
 from msk_ray.training import SavedPolicy
@@ -87,11 +87,13 @@ class MyoSuiteScorer:
         runs, versions = [], {}
         for seed in seeds:
             asked = {"env": ENVIRONMENT, "reset": reset, "seed": seed}
-            with _Worker(self._python, {**asked, "episodes": request.worlds, "steps": request.steps}) as running:
+            with _MyoSuiteProcess(
+                self._python, {**asked, "episodes": request.worlds, "steps": request.steps}
+            ) as running:
                 runs.append(running.episodes(act, request.worlds, request.steps))
                 versions = running.versions
         setup = EvaluationSetup(request.physics, False, request.worlds, seeds, request.steps, "cpu")
-        return entry_of(policy, setup, runs, worker.TERMS) | {"myosuite": versions}
+        return entry_of(policy, setup, runs, myosuite_side.TERMS) | {"myosuite": versions}
 
 
 def _acting(policy: SavedPolicy) -> _Act:
@@ -111,12 +113,12 @@ def _acting(policy: SavedPolicy) -> _Act:
     return act
 
 
-class _Worker(ForeignProcess):
+class _MyoSuiteProcess(ForeignProcess):
     """A process of MyoSuite's Python."""
 
     def __init__(self, python: Path, asked: dict[str, Any]) -> None:
-        super().__init__(MYOSUITE, python, worker.__file__, asked)
-        self._record = worker.record(self.hello["observations"])
+        super().__init__(MYOSUITE, python, myosuite_side.__file__, asked)
+        self._record = myosuite_side.record(self.hello["observations"])
 
     def episodes(self, act: _Act, count: int, steps: int) -> Episodes:
         """`count` episodes of at most `steps` steps, one after the other, as a tensor entry each."""

@@ -20,8 +20,8 @@ from msk_ray.errors import ConfigError
 from msk_ray.evaluate.foreign_process import ForeignProcess
 from msk_ray.evaluate.measure import EvaluationSetup, Request, entry_of
 from msk_ray.robots.config import ServoSettings
-from msk_ray.robots.mjlab import worker
-from msk_ray.robots.mjlab.elsewhere import MJLAB
+from msk_ray.robots.mjlab import mjlab_side
+from msk_ray.robots.mjlab.declaration import MJLAB
 from msk_ray.robots.servos import action_scale_of
 from msk_ray.robots.tracking.config import G1TrackingSettings
 from msk_ray.robots.tracking.env import G1Tracking
@@ -145,18 +145,18 @@ class MjlabScorer:
         runs = []
         with motion_of(policy.config) as motion:
             for seed in seeds:
-                with _Worker(self._python, {**order, "seed": seed, "motion": motion}) as process:
+                with _MjlabProcess(self._python, {**order, "seed": seed, "motion": motion}) as process:
                     runs.append(process.episodes(policy))
         setup = EvaluationSetup(request.physics, False, request.worlds, seeds, request.steps, process.device)
         return entry_of(policy, setup, runs, process.terms) | {"mjlab": process.versions}
 
 
-class _Worker(ForeignProcess):
+class _MjlabProcess(ForeignProcess):
     """A process of mjlab's Python that runs the episodes of one seed.
 
     Args:
         python: the interpreter.
-        order: what to run, as `worker` describes.
+        order: what to run, as `mjlab_side` describes.
 
     Attributes:
         device: name of the device that it runs on.
@@ -164,14 +164,14 @@ class _Worker(ForeignProcess):
     """
 
     def __init__(self, python: Path, order: dict[str, Any]) -> None:
-        super().__init__(MJLAB, python, worker.__file__, order)
+        super().__init__(MJLAB, python, mjlab_side.__file__, order)
         self._order = order
         self.device: str = self.hello["device"]
         self.terms: list[str] = self.hello["terms"]
         self._observations: int = self.hello["observations"]
-        command = worker.command_name(order["motion"])
-        self._record = worker.record(self._observations, len(self.terms), command)
-        self._errors = worker.ERRORS[command]
+        command = mjlab_side.command_name(order["motion"])
+        self._record = mjlab_side.record(self._observations, len(self.terms), command)
+        self._errors = mjlab_side.ERRORS[command]
 
     def episodes(self, policy: SavedPolicy) -> Episodes:
         """The first episode of each world."""

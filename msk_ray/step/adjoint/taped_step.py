@@ -6,8 +6,8 @@ import warp as wp
 
 from msk_ray.step.adjoint import StepAdjoint
 from msk_ray.step.adjoint.coverage.check import check_supported
-from msk_ray.step.adjoint.stages.integrate import add_into
 from msk_ray.step.adjoint.stages.substep_pullback import substep_pullback
+from msk_ray.step.forward.arrays import add_into
 from msk_ray.step.forward.batch import WorldBatch
 
 

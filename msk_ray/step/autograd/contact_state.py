@@ -123,7 +123,3 @@ class AirTime(NamedTuple):
     def first_contact(self, duration: float) -> Tensor:
         """Whether the contact began within the last `duration` [s], bool (W, n)."""
         return (self.contact > 0.0) & (self.contact < duration + _ROUNDING)
-
-    def first_air(self, duration: float) -> Tensor:
-        """Whether the contact ended within the last `duration` [s], bool (W, n)."""
-        return (self.air > 0.0) & (self.air < duration + _ROUNDING)

@@ -1,9 +1,21 @@
-"""Groups of arrays that kernels take as one argument: gathered from other structures, or allocated."""
+"""Groups of arrays that kernels take as one argument: gathered from other structures, or allocated. And a sum."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import warp as wp
+
+
+@wp.kernel(enable_backward=False)
+def add_into(
+    # In:
+    x_in: wp.array2d[float],
+    # Out:
+    y_out: wp.array2d[float],
+) -> None:
+    """y += x."""
+    i, j = wp.tid()
+    y_out[i, j] = y_out[i, j] + x_in[i, j]
 
 
 def gather(kind: Any, *holders: Any) -> Any:

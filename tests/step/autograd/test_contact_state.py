@@ -27,7 +27,6 @@ def test_time_in_the_air_by_hand() -> None:
     assert second.first_contact(0.2).tolist() == [[True, False]]
     third = second.after(torch.tensor([[[True, False]]]), 0.1)
     assert third.last_contact.tolist() == [pytest.approx([0.0, 0.5])]
-    assert third.first_air(0.1).tolist() == [[False, True]]
     assert third.memory.shape == memory.shape
 
 

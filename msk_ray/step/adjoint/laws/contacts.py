@@ -53,7 +53,7 @@ def along_frame(frame: wp.mat33, weight: vec6, first: int) -> wp.vec3:
 
 
 @wp.func
-def frame_weight(frame: wp.mat33, weight: vec6, slide: wp.vec3, spin: wp.vec3) -> wp.mat33:
+def frame_weight(weight: vec6, slide: wp.vec3, spin: wp.vec3) -> wp.mat33:
     """Cotangent of the frame where components with these weights are read off it."""
     out = wp.mat33()
     for k in range(3):
@@ -228,9 +228,9 @@ def pull_contacts(
             + wp.cross(vel_force, rates.vel_spin)
         )
         contact_bars_out.frame[con] = (
-            frame_weight(frame, lam_bar, rates.lam_slide, rates.lam_spin)
-            + frame_weight(frame, acc_bar, rates.acc_slide, rates.acc_spin)
-            + frame_weight(frame, vel_bar, rates.vel_slide, rates.vel_spin)
+            frame_weight(lam_bar, rates.lam_slide, rates.lam_spin)
+            + frame_weight(acc_bar, rates.acc_slide, rates.acc_spin)
+            + frame_weight(vel_bar, rates.vel_slide, rates.vel_spin)
         )
         for side in range(2):
             body = body1

@@ -70,8 +70,6 @@ class RowSlopes:
     """b = -∂aref/∂ρ(v) [1/s]."""
     spring: float
     """k imp [1/s²]."""
-    impedance: float
-    """imp."""
     stiffness: float
     """-∂aref/∂pos, with the slope of imp [1/s²]."""
     mass: float
@@ -87,7 +85,6 @@ def row_slopes(disableflags: int, timestep: float, solref: wp.vec2, solimp: vec5
     out = RowSlopes()
     out.damping = kb[1]
     out.spring = kb[0] * imp
-    out.impedance = imp
     out.stiffness = kb[0] * (imp + slope * pos)
     out.mass = slope / (imp * (1.0 - imp))
     return out

@@ -263,18 +263,6 @@ def clip_norm(
         clipped_out[worldid] += 1
 
 
-@wp.kernel
-def add_into(
-    # In:
-    x_in: wp.array2d[float],
-    # Out:
-    y_out: wp.array2d[float],
-) -> None:
-    """y += x, as gradients add up."""
-    i, j = wp.tid()
-    y_out[i, j] = y_out[i, j] + x_in[i, j]
-
-
 class Integrator:
     """Launches of the integration of positions, and of what begins and ends an env step's pullback.
 

@@ -12,19 +12,10 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
+from msk_ray.step.forward.arrays import add_into
+
 _KINDS = ("jnt", "site_pair", "geom")
 """Kinds of elements, each with two arrays of the model: the elements' tendons, and their addresses."""
-
-
-@wp.kernel(enable_backward=False)
-def add_part(
-    # In:
-    part_in: wp.array2d[float],
-    # Out:
-    total_out: wp.array2d[float],
-) -> None:
-    worldid, i = wp.tid()
-    total_out[worldid, i] = total_out[worldid, i] + part_in[worldid, i]
 
 
 class TendonOrder:
@@ -61,7 +52,7 @@ class TendonOrder:
         for model in self._parts:
             mjw.tendon(model, own)
             for part, total in zip(parts, totals, strict=True):
-                wp.launch(add_part, dim=total.shape, inputs=[part], outputs=[total])
+                wp.launch(add_into, dim=total.shape, inputs=[part], outputs=[total])
 
 
 def _rank(tendons: np.ndarray) -> np.ndarray:

@@ -131,15 +131,16 @@ def core_reach(other: Solid, dist: float) -> float:
 
 
 @wp.func
-def misses_face(solid: Solid, other: Solid, plane: wp.vec3, point: wp.vec3, outward: wp.vec3, dist: float) -> float:
+def misses_face(other: Solid, plane: wp.vec3, point: wp.vec3, outward: wp.vec3, dist: float) -> float:
     """How far a contact is from one with a face of its normal, beyond what it is from one of its own normal [m].
 
     Witness points lie on one normal. A sphere or a capsule touches with a point that is its radius off its core, along
     the normal. Where MuJoCo clips a capsule's side, that need not hold for either normal.
 
     Args:
+        other: the other geom.
         plane: outward normal of the face.
-        point: where the contact is on the solid.
+        point: where the contact is on the geom of the face.
         outward: normal of the contact.
         dist: distance.
     """
@@ -214,7 +215,7 @@ def patch_at(
             run = wp.normalize(solid.mat @ run)
             off_face = float(1.0e30)
             if face >= 0:
-                off_face = misses_face(solid, other, solid.mat @ face_normal(solid, meshes, face), point, outward, dist)
+                off_face = misses_face(other, solid.mat @ face_normal(solid, meshes, face), point, outward, dist)
             if sine < slack or (sine < _FLAT and off_face <= wp.max(to_edge, rounding)):
                 patch.kind = FACE
                 patch.face = face

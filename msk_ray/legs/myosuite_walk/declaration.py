@@ -1,6 +1,6 @@
 """`evaluate --in myosuite`, as an entry point declares it; read before torch is loaded."""
 
-from msk_ray.evaluate.elsewhere import ForeignScoring
+from msk_ray.evaluate.foreign_scoring import ForeignScoring
 
 MYOSUITE = ForeignScoring(
     name="myosuite",

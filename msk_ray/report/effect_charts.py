@@ -30,8 +30,9 @@ from msk_ray.report.charts import (
     plain,
     rounded,
 )
+from msk_ray.report.effects import LEAST, Effect, TrialScore
 from msk_ray.report.reading import Reading
-from msk_ray.report.statistics import LEAST, Effect, TrialScore, effects, mean_interval
+from msk_ray.report.statistics import mean_interval
 from msk_ray.text import printable
 
 PANELS = 4
@@ -54,20 +55,6 @@ _STYLES = (
 )
 _DECADES = 30.0
 """Numbers whose largest is more than this many times the smallest are drawn on a logarithmic axis."""
-
-
-def ranked_effects(reading: Reading, places: Mapping[Path, int]) -> list[Effect]:
-    """Effects of the experiment's parameters on the best score, the largest first.
-
-    Args:
-        places: trials' positions in the page's list.
-    """
-    return effects(
-        [
-            TrialScore(t.trial.changed, t.trial.values, t.trial.seed, t.score, t.cut, places[t.folder])
-            for t in reading.trials
-        ]
-    )
 
 
 def parameter_effects(ranked: Sequence[Effect], name: str) -> Picture | None:

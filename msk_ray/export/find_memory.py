@@ -1,4 +1,6 @@
-"""What an exported policy remembers from call to call, read off the environment's methods.
+"""What an exported policy has to remember from call to call, found from the environment's methods.
+
+`PolicyToControl.forward` in `export/network.py` does the carrying.
 
 A memory is carried by the file where `remember` gives a matrix product of the memories before, the entries of the
 observation and the action: last actions, filters, delay lines, histories of what was observed before. Entries of the

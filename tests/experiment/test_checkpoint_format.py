@@ -8,7 +8,7 @@ import pytest
 from fault_campaign.killed import die_within
 
 from msk_ray.errors import CheckpointError, StorageFailure
-from msk_ray.experiment.checkpoint_file import (
+from msk_ray.experiment.checkpoint_format import (
     read_checkpoint_file,
     read_facts,
     write_checkpoint_file,

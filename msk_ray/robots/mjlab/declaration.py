@@ -1,6 +1,6 @@
 """`evaluate --in mjlab`, as an entry point declares it. Imports no torch: the command line reads it."""
 
-from msk_ray.evaluate.elsewhere import ForeignScoring
+from msk_ray.evaluate.foreign_scoring import ForeignScoring
 
 MJLAB = ForeignScoring(
     name="mjlab",

@@ -6,6 +6,8 @@
 
 The first two lines are the head: metadata such as the epoch and the score can be read without the payload. Every bit of
 the file is verified: by the first line, the digest in it, or the digest in the second.
+
+Which checkpoint of a trial is the newest usable one: `training/checkpoint.py`.
 """
 
 import contextlib
