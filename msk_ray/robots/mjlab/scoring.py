@@ -194,11 +194,12 @@ class _MjlabProcess(ForeignProcess):
             fell |= ended
             running &= ~ended
             obs = np.ascontiguousarray(step["obs"])
+        diverged = ~np.isfinite(sums["reward"])
         return Episodes(
             score=torch.from_numpy(sums["reward"]),
             length=torch.from_numpy(length),
-            fell=torch.from_numpy(fell),
-            diverged=torch.from_numpy(~np.isfinite(sums["reward"])),
+            fell=torch.from_numpy(fell & ~diverged),
+            diverged=torch.from_numpy(diverged),
             terms=torch.from_numpy(sums["terms"]),
             outcomes={name: torch.from_numpy(sums[name]) for name in self._errors},
             success=None,

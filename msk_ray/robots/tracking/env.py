@@ -146,11 +146,11 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         angles, rates = self.references.joints(frame).chunk(2, dim=-1)
         shift = self._pose_noise * self.uniform(count, 6)
         orientation = quat_multiply(_from_euler(shift[:, 3:]), orientation)
-        push = self._velocity_noise * self.uniform(count, 6)
+        change = self._velocity_noise * self.uniform(count, 6)
         angles = (angles + self._joint_noise * self.uniform(count, angles.shape[1])).clamp(*self.joint_limits)
-        spin_in_base = quat_rotate(quat_conjugate(orientation), spin + push[:, 3:])
+        spin_in_base = quat_rotate(quat_conjugate(orientation), spin + change[:, 3:])
         qpos = torch.cat((position + shift[:, :3], orientation, angles), dim=-1)
-        qvel = torch.cat((velocity + push[:, :3], spin_in_base, rates), dim=-1)
+        qvel = torch.cat((velocity + change[:, :3], spin_in_base, rates), dim=-1)
         return StepState(qpos, qvel, self._act.repeat(count, 1))
 
     def spread_ages(self) -> None:
