@@ -96,12 +96,12 @@ class Delays:
         if self._control is None and self._substep is None:
             return [control]
         whole = _drawn(self._control, state, numbers, "control_delay")
-        lates = [whole]
+        delays = [whole]
         if self._substep is not None:
             part = _drawn(self._substep, state, numbers, "control_delay_substeps")
-            lates = [whole + (part > k) for k in range(self._substeps)]
+            delays = [whole + (part > k) for k in range(self._substeps)]
         earlier = state.memory.get(_CONTROLS)
-        return [_of_earlier(control, earlier, self._possible(late, state)) for late in lates]
+        return [_of_earlier(control, earlier, self._possible(late, state)) for late in delays]
 
     @staticmethod
     def _possible(late: Tensor, state: EnvState) -> Tensor:
