@@ -46,7 +46,7 @@ class Task(ABC, Generic[SettingsT]):
     """Entries of an observation; that of the first one unless a class sets it."""
     critic_size: int
     """Entries of what the critic sees."""
-    recorded_worlds: int = 0
+    kept_worlds: int = 0
     """Worlds of every evaluation whose states `trajectory_figures` is given."""
     terms: ClassVar[tuple[Term, ...]] = ()
     """The terms of the reward. Their weights are settings: a class whose `Settings` lack them gets such that have them.
@@ -217,7 +217,7 @@ class Task(ABC, Generic[SettingsT]):
         return {}
 
     def trajectory_figures(self, trajectories: Sequence[StepState]) -> dict[str, float]:
-        """Further figures of an evaluation, by name, from all states of `recorded_worlds` episodes, (T, n), on CPU."""
+        """Further figures of an evaluation, by name, from all states of `kept_worlds` episodes, (T, n), on CPU."""
         return {}
 
     def success(self, tail: dict[str, Tensor]) -> Tensor | None:

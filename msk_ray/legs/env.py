@@ -104,7 +104,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
         self.flexion_qpos = columns([joint.qposadr[0] for joint in flexions], self.device)
         self._tasked = self.config.clock or self.config.speed_range is not None
         self.assistance = Assistance(self.config.assist, self.config.control_timestep, self.device)
-        self.recorded_worlds = self.config.gait_worlds
+        self.kept_worlds = self.config.gait_worlds
         self.mass = float(self.model.body_subtreemass[0])
         self._masses = muscle_masses(self.curves.peak, self.curves.optimum)
         if self._tasked:

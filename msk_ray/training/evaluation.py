@@ -104,7 +104,7 @@ class Evaluator:
         Returns:
             For each its `score` and the standard deviation over worlds, mean episode `length`, `fall_rate`,
             `diverged_rate`, mean return of each reward term, step means of the environment's outcome terms, and
-            `success_rate` where the environment defines success, and its `trajectory_figures` if it records worlds.
+            `success_rate` where the environment defines success, and its `trajectory_figures` if it has `kept_worlds`.
 
         Raises:
             SimulationError: as for `episodes`.
@@ -112,22 +112,18 @@ class Evaluator:
         at_once = (policies[first : first + self._policies] for first in range(0, len(policies), self._policies))
         return [figures for some in at_once for figures in self._run(some)]
 
-    def check_recorded(self) -> None:
-        """Raise if the environment wants to record more worlds than `run` has.
-
-        Raises:
-            ConfigError: it wants too many.
-        """
-        wanted = self.env.recorded_worlds
+    def check_kept_worlds(self) -> None:
+        """Raise ConfigError if the environment wants the states of more worlds than an evaluation has."""
+        wanted = self.env.kept_worlds
         if wanted > self._worlds:
             raise ConfigError(
-                f"the environment records {wanted} worlds of every evaluation, which has {self._worlds}: write an "
+                f"the environment keeps {wanted} worlds of every evaluation, which has {self._worlds}: write an "
                 f"evaluation.nworld of {wanted} or more"
             )
 
     def _run(self, policies: Sequence[Policy]) -> list[dict[str, float]]:
         """The figures of each policy; at most `policies` of them."""
-        kept = self.env.recorded_worlds
+        kept = self.env.kept_worlds
         if not kept:
             return [self._figures(episodes) for episodes in self._episodes(policies)]
         states: list[StepState] = []

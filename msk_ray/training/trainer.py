@@ -96,7 +96,7 @@ class Trainer(TrialFolder):
             self.algorithm = make_algorithm(config, device, group)
             self.env = self.algorithm.env
             self.evaluator = Evaluator(config, device, policies=self.together)
-            self.evaluator.check_recorded()
+            self.evaluator.check_kept_worlds()
         self._scoring = Scoring(self, self.algorithm, self.evaluator, self._log, self.together)
         self._damages: tuple[Damage, ...] = ()
         self._unreadable: list[str] = []

@@ -82,7 +82,7 @@ def test_the_command_writes_json_and_a_picture(tmp_path: Path, capsys: pytest.Ca
         }
     )
     fewer = config.model_copy(update={"evaluation": config.evaluation.model_copy(update={"nworld": 1})})
-    with pytest.raises(ConfigError, match=r"records 2 worlds of every evaluation.*evaluation.nworld of 2 or more"):
+    with pytest.raises(ConfigError, match=r"keeps 2 worlds of every evaluation.*evaluation.nworld of 2 or more"):
         Trainer(fewer, tmp_path / "refused", "cpu")
     trainer = Trainer(config, tmp_path / "trial", "cpu")
     row = trainer.run_epoch()
