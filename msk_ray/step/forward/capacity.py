@@ -12,9 +12,6 @@ from msk_ray.step.forward.geom_pairs import candidate_pairs, contacts_of, rows_p
 
 _LARGEST_BOUND = 256
 """Contacts per world up to which the geometric bound is allocated; above it a probe measures what is needed."""
-_ON_FIELDS = 2
-"""Factor on the contacts that C MuJoCo finds of a geom and a height field. Their bound, 50, is that of a geom as large as
-many cells; a foot has a few."""
 _MARGIN = 1.5
 """Factor on what the probe needed, because a policy reaches states that random controls do not."""
 _PROBE_TIME = 1.0
@@ -61,8 +58,7 @@ class _Counter:
         self._model = model
         self._pairs = candidate_pairs(model, filtered=True)
         self._contacts = np.minimum(contacts_of(model, self._pairs), mujoco.mjMAXCONPAIR)
-        self._rows_each = rows_per_contact(model, self._pairs)
-        self._fields = (model.geom_type[self._pairs] == mujoco.mjtGeom.mjGEOM_HFIELD).any(axis=1)
+        self._rows = self._contacts * rows_per_contact(model, self._pairs)
         self._place = np.full((model.ngeom, model.ngeom), -1, dtype=np.int32)
         self._place[self._pairs[:, 0], self._pairs[:, 1]] = np.arange(len(self._pairs))
         self._first, self._second = self._pairs.T
@@ -88,12 +84,10 @@ class _Counter:
         # Count by touching pairs, because mujoco_warp and C MuJoCo may return different numbers of contacts for a pair.
         geoms = np.sort(np.asarray(data.contact.geom).reshape(-1, 2), axis=1)
         of_geoms = geoms[:, 0] >= 0
-        places = self._place[geoms[of_geoms, 0], geoms[of_geoms, 1]]
-        touching, found = np.unique(places[places >= 0], return_counts=True)
-        likely = np.where(self._fields[touching], _ON_FIELDS * found, self._contacts[touching])
-        each = np.minimum(self._contacts[touching], likely)
-        contacts = int(each.sum()) + int(np.count_nonzero(~of_geoms))
-        rows = int((each * self._rows_each[touching]).sum()) + scalar_rows(self._model)
+        touching = np.unique(self._place[geoms[of_geoms, 0], geoms[of_geoms, 1]])
+        touching = touching[touching >= 0]
+        contacts = int(self._contacts[touching].sum()) + int(np.count_nonzero(~of_geoms))
+        rows = int(self._rows[touching].sum()) + scalar_rows(self._model)
         return Capacity(max(contacts, data.ncon, self._near(data)), max(rows, data.nefc))
 
     def _near(self, data: mujoco.MjData) -> int:
@@ -119,8 +113,7 @@ def scalar_rows(model: mujoco.MjModel) -> int:
 
 
 def geometric_bound(model: mujoco.MjModel) -> Capacity | None:
-    """Upper bound on the room for any pose; None if the geometry gives no bound (height fields, distance fields,
-    flexes).
+    """Upper bound on the room for any pose; None if the geometry gives no bound (distance fields, flexes).
 
     Counts every pair of geoms that collision masks or explicit pairs allow. The parent filter is not applied, so the
     bound may be too large. It is zero for a model without contacts and other constraints.

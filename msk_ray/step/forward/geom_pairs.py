@@ -13,8 +13,10 @@ _CONTACTS_PER_PAIR = {
     mujoco.mjtGeom.mjGEOM_BOX: 8,
     mujoco.mjtGeom.mjGEOM_MESH: 8,
 }
+_ON_FIELD = 4
+"""Largest number of contacts that mujoco_warp keeps of a geom and a height field, of all triangles that touch."""
 _UNBOUNDED = 1 << 30
-"""Number that means "no bound": height fields and signed distance fields."""
+"""Number that means "no bound": signed distance fields."""
 
 
 def candidate_pairs(model: mujoco.MjModel, filtered: bool) -> NDArray[np.int64]:
@@ -53,7 +55,9 @@ def contacts_of(model: mujoco.MjModel, pairs: NDArray[np.int64]) -> NDArray[np.i
     both = counts[pairs].max(axis=1) if len(pairs) else least
     unbounded = both == _UNBOUNDED
     least = np.where(unbounded, _UNBOUNDED, least)
-    return np.where(least == 2 * _UNBOUNDED, 0, least)
+    counts_of_pairs = np.where(least == 2 * _UNBOUNDED, 0, least)
+    fields = model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD
+    return np.where(fields[pairs].any(axis=1), _ON_FIELD, counts_of_pairs)
 
 
 def rows_per_contact(model: mujoco.MjModel, pairs: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -66,15 +66,29 @@ def test_the_probe_is_repeatable(monkeypatch):
     assert probe(studded_plate()) == first
 
 
-def test_without_a_bound_the_probe_decides():
+def test_of_a_geom_on_a_height_field_mujoco_warp_keeps_four_contacts():
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><asset><hfield name="h" nrow="3" ncol="3" size="1 1 .1 .1"/></asset><worldbody>
         <geom type="hfield" hfield="h"/><body pos="0 0 .2"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
     )
+    assert default_capacity(model) == (Capacity(4, 4 * 4),) * 2
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 300)
+    assert data.ncon == 6, "C MuJoCo keeps more"
+    batch = WorldBatch(model, 1, 1, "cpu")
+    batch.data.qpos.assign(data.qpos[None].astype(np.float32))
+    batch.launch_step()
+    assert batch.data.nacon.numpy()[0] == 4
+
+
+def test_without_a_bound_the_probe_decides():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><flexcomp name="cloth" type="grid" count="3 3 1"
+        spacing=".1 .1 .1" pos="0 0 .05" dim="2" radius=".01" mass="1"/></worldbody></mujoco>"""
+    )
     start, bound = default_capacity(model)
     assert bound is None
-    assert start.contacts == 48, "the least"
-    assert 24 <= start.rows <= 72, "the ball rests on 6 contacts of 4 rows, and a pair may have 50"
+    assert start.contacts >= 48
 
 
 def test_every_overflow_of_mujoco_warp_is_known():
