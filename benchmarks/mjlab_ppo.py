@@ -63,12 +63,15 @@ def main() -> None:
 
 def train(args: argparse.Namespace) -> None:
     """Train until the last of the times. A line is printed every 25 iterations and for each policy that is kept."""
+    if args.to.exists():
+        raise SystemExit(f"{args.to} exists: write another folder in --to")
     args.to.mkdir(parents=True)
     cfg = load_env_cfg(args.task)
     cfg.scene.num_envs, cfg.seed = args.worlds, args.seed
     torch.manual_seed(args.seed)
     env, runner = runner_in(ManagerBasedRlEnv(cfg, args.device), args.task, args.seed, args.device)
     waiting = sorted(60.0 * minutes for minutes in args.minutes)
+    trial = {"task": args.task, "seed": args.seed, "worlds": args.worlds, "trained_on": device_name(args.device)}
     print(f"{time.monotonic() - BEGIN:.1f} s: training begins", flush=True)
 
     def keep(it: int, **others: object) -> None:
@@ -81,15 +84,9 @@ def train(args: argparse.Namespace) -> None:
         if seconds < waiting[0]:
             return
         waiting.pop(0)
-        facts = {
-            "task": args.task,
-            "seed": args.seed,
-            "worlds": args.worlds,
-            "trained_on": device_name(args.device),
-            **facts,
-        }
-        torch.save({"facts": facts, "policy": runner.alg.get_policy().state_dict()}, args.to / f"{it + 1:06d}.pt")
-        print(f"Wrote {args.to}/{it + 1:06d}.pt after {seconds:.0f} s", flush=True)
+        file = args.to / f"{it + 1:06d}.pt"
+        torch.save({"facts": trial | facts, "policy": runner.alg.get_policy().state_dict()}, file)
+        print(f"Wrote {file} after {seconds:.0f} s", flush=True)
         if not waiting:
             raise TimeIsUp
 
@@ -155,9 +152,9 @@ def means(env, errors, policy) -> dict[str, float]:  # type: ignore[no-untyped-d
             a_step[name] = a_step.get(name, 0.0) + (error * (running & ~ended)).sum()
         steps += running.sum()
         running &= ~ended
-    means = {name: value / worlds for name, value in an_episode.items()}
-    means |= {name: value / steps for name, value in a_step.items()}
-    return {name: round(float(mean), 4) for name, mean in means.items()}
+    found = {name: value / worlds for name, value in an_episode.items()}
+    found |= {name: value / steps for name, value in a_step.items()}
+    return {name: round(float(mean), 4) for name, mean in found.items()}
 
 
 if __name__ == "__main__":

@@ -27,10 +27,10 @@ _EAGER_STEPS = 2
 class Evaluator:
     """Runs policies from the same initial states every time, under reference rewards and reference physics.
 
-    The score is the return of each world's first episode under the environment's default reward weights,
-    whatever weights the trial trains on, and under the physics of `evaluation.variant` (the environment's reference if
-    null). So trials with different rewards or contacts are comparable. Initial states are drawn on the CPU, so they are
-    the same on every device.
+    The score is the return of each world's first episode under the environment's default reward weights, whatever
+    weights the trial trains on, and under the physics of `evaluation.variant` (the environment's reference if null). So
+    trials with different rewards or contacts are comparable. Initial states are drawn on the CPU, so they are the same
+    on every device.
 
     Args:
         config: the trial's config; its `evaluation` section sets worlds, steps and seed.
