@@ -47,8 +47,6 @@ from msk_ray.config.recorded import current_space as current_space
 from msk_ray.config.recorded import current_values as current_values
 from msk_ray.config.recorded import env_name as env_name
 from msk_ray.config.schedules import CommandSchedule as CommandSchedule
-from msk_ray.config.schedules import CostSchedule as CostSchedule
-from msk_ray.config.schedules import cost_share as cost_share
 from msk_ray.config.schema import Config as Config
 from msk_ray.config.schema import ContactCurriculum as ContactCurriculum
 from msk_ray.config.schema import ContactStart as ContactStart

@@ -1,6 +1,6 @@
 """Values that change linearly over training, for epochs counted from 0."""
 
-from typing import Any, Self
+from typing import Self
 
 from pydantic import model_validator
 
@@ -12,8 +12,11 @@ def ramp(start: float, end: float, epoch: float, last: int, first: int = 0) -> f
     return start + (end - start) * min(1.0, max(0.0, (epoch - first) / (last - first)))
 
 
-class Rise(Section):
-    """A factor that is `start` until the epoch `begin`, 1 from the epoch `end` on, and linear in between."""
+class CommandSchedule(Section):
+    """Factor on the ranges of commands in training: a humanoid that is asked to run from the start learns to stand.
+
+    It is `start` until the epoch `begin`, 1 from the epoch `end` on, and linear in between.
+    """
 
     start: Fraction
     begin: Whole
@@ -28,21 +31,3 @@ class Rise(Section):
     def at(self, epoch: int) -> float:
         """The factor at `epoch`, counted from 0."""
         return ramp(self.start, 1.0, epoch, self.end, self.begin)
-
-
-class CostSchedule(Rise):
-    """Factor on the weights of costs in training.
-
-    A robot that pays in full for every change of its action from the start learns to stand still before it learns to
-    walk; one that pays nothing learns to tremble.
-    """
-
-
-class CommandSchedule(Rise):
-    """Factor on the ranges of commands in training. A humanoid that is asked to run from the start learns to stand."""
-
-
-def cost_share(settings: Any, epoch: int) -> float:
-    """`Term.schedule` of a cost, for an environment that has a setting `cost_schedule: CostSchedule | None`."""
-    schedule: CostSchedule | None = settings.cost_schedule
-    return 1.0 if schedule is None else schedule.at(epoch)

@@ -27,7 +27,7 @@ from msk_ray.config.horizons import HorizonSchedule
 from msk_ray.config.loggers import logger_paths
 from msk_ray.config.packages import require
 from msk_ray.config.physics import PhysicsConfig
-from msk_ray.config.schedules import Rise
+from msk_ray.config.schedules import CommandSchedule
 from msk_ray.config.sections import SHOWN, Count, EnvSettings, Section, Text, Undeclared, Whole
 from msk_ray.config.unread import unread_settings
 from msk_ray.errors import ConfigError, brief
@@ -164,7 +164,7 @@ class Config(Section):
     @property
     def unfinished(self) -> list[str]:
         """A line for each schedule that training ends before. No error, because epochs can be added to a trial."""
-        ends = {f"env.{name}.end": value.end for name, value in self.env if isinstance(value, Rise)}
+        ends = {f"env.{name}.end": value.end for name, value in self.env if isinstance(value, CommandSchedule)}
         if self.curriculum is not None:
             ends["curriculum.epochs"] = self.curriculum.epochs
         for name, value in self.algorithm_settings:

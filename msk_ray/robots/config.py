@@ -7,7 +7,7 @@ from pydantic import Field, PositiveFloat
 
 from msk_ray.config.commands import Command, with_commands
 from msk_ray.config.rewards import reward_section, with_reward
-from msk_ray.config.schedules import CommandSchedule, CostSchedule, cost_share
+from msk_ray.config.schedules import CommandSchedule
 from msk_ray.config.sections import Count, Fraction, NonNegative, Reward
 from msk_ray.config.terms import Term, terms_in
 from msk_ray.envs.mjcf.config import MjcfSettings
@@ -53,12 +53,12 @@ def velocity_terms(*others: Term) -> tuple[Term, ...]:
         Term("upright", 1.0),
         Term("pose", 1.0, "variable_posture"),
         Term("dof_pos_limits", -1.0),
-        Term("action_rate_l2", -0.1, schedule=cost_share),
+        Term("action_rate_l2", -0.1),
         Term("air_time", 0.0, gradient=False, optional=True),
-        Term("foot_clearance", -2.0, schedule=cost_share),
-        Term("foot_swing_height", -0.25, gradient=False, schedule=cost_share),
-        Term("foot_slip", -0.1, schedule=cost_share),
-        Term("soft_landing", -1e-5, gradient=False, schedule=cost_share),
+        Term("foot_clearance", -2.0),
+        Term("foot_swing_height", -0.25, gradient=False),
+        Term("foot_slip", -0.1),
+        Term("soft_landing", -1e-5, gradient=False),
         *others,
     )
 
@@ -84,29 +84,27 @@ class VelocitySettings(ServoSettings):
     seldom gets out of it; 0: they do not. Scores ignore it."""
     command_schedule: CommandSchedule | None = None
     """Factor on the ranges of the commanded velocity and yaw rate in training; null: 1."""
-    cost_schedule: CostSchedule | None = None
-    """Factor on the weights of costs in training, all but `dof_pos_limits`; null: 1."""
     reward: VelocityShape = VelocityShape()
 
 
 GO1_TERMS = velocity_terms(
-    Term("body_ang_vel", 0.0, schedule=cost_share, optional=True),
-    Term("angular_momentum", 0.0, schedule=cost_share, optional=True),
+    Term("body_ang_vel", 0.0, optional=True),
+    Term("angular_momentum", 0.0, optional=True),
 )
 GO1_ROUGH_TERMS = (
     *(term for term in GO1_TERMS if term.name != "upright"),
     *terms_in(
         "msk_ray.robots.terms",
         Term("upright", 1.0, "upright_on_ground"),
-        Term("self_collisions", -0.1, gradient=False, schedule=cost_share),
-        Term("shank_collision", -0.1, gradient=False, schedule=cost_share),
-        Term("trunk_head_collision", -0.1, gradient=False, schedule=cost_share),
+        Term("self_collisions", -0.1, gradient=False),
+        Term("shank_collision", -0.1, gradient=False),
+        Term("trunk_head_collision", -0.1, gradient=False),
     ),
 )
 G1_TERMS = velocity_terms(
-    Term("body_ang_vel", -0.05, schedule=cost_share),
-    Term("angular_momentum", -0.02, schedule=cost_share),
-    Term("self_collisions", -1.0, gradient=False, schedule=cost_share),
+    Term("body_ang_vel", -0.05),
+    Term("angular_momentum", -0.02),
+    Term("self_collisions", -1.0, gradient=False),
     Term("base_height", 0.0, optional=True),
 )
 Go1Reward = reward_section("Go1Reward", __name__, GO1_TERMS, VelocityShape)

@@ -54,10 +54,9 @@ def test_a_fault_is_named_on_one_line(data: dict, message: str) -> None:
 
 def test_schedules_that_training_ends_before_are_named() -> None:
     """Not refused, because epochs can be added to a trial."""
-    go1 = load_config("go1_velocity")
-    assert go1.unfinished == []
-    (line,) = load_config("go1_velocity", ["trial.epochs=450", "env.cost_schedule.end=900"]).unfinished
-    assert line.startswith("env.cost_schedule.end is epoch 900, but training ends at trial.epochs, 450")
+    assert load_config("g1_velocity").unfinished == []
+    (line,) = load_config("g1_velocity", ["trial.epochs=450", "env.command_schedule.end=900"]).unfinished
+    assert line.startswith("env.command_schedule.end is epoch 900, but training ends at trial.epochs, 450")
     (line,) = load_config("ant", ["curriculum={start: {solref: [0.05, 1.0]}, epochs: 100000}"]).unfinished
     assert line.startswith("curriculum.epochs is epoch 100000")
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from slopes import check_slopes
 
-from msk_ray.config import CommandSchedule, CostSchedule, PhysicsConfig
+from msk_ray.config import CommandSchedule, PhysicsConfig
 from msk_ray.config.environments import settings_class
 from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
@@ -116,21 +116,9 @@ def test_a_pose_tail_gives_pose_terms_a_slope_in_training_but_not_in_scores() ->
     assert type(tailed).reference_settings(tailed.config).reward.pose_tail == 0.0
 
 
-def test_costs_rise_in_training_but_not_in_scores() -> None:
-    schedule = CostSchedule(start=0.1, begin=500, end=900)
-    assert [schedule.at(epoch) for epoch in (0, 500, 700, 900, 2000)] == pytest.approx([0.1, 0.1, 0.55, 1.0, 1.0])
-    env = make(1, cost_schedule=schedule)
-    costs = [term.schedule is not None for term in env.active_terms]
-    names = [term.name for term, cost in zip(env.active_terms, costs, strict=True) if not cost]
-    assert names == ["track_linear_velocity", "track_angular_velocity", "upright", "pose", "dof_pos_limits"]
-    assert env.weighted_terms.shares.tolist() == [1.0] * len(costs)  # as in scores, which begin no epoch
-    env.enter_epoch(0)
-    assert env.weighted_terms.shares.tolist() == pytest.approx([0.1 if cost else 1.0 for cost in costs])
-
-
 def test_commands_widen_in_training_but_not_in_scores() -> None:
-    env = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
-    scored = make(64, "g1", command_schedule=CommandSchedule(start=0.5, begin=100, end=200))
+    schedule = CommandSchedule(start=0.5, begin=100, end=200)
+    env, scored = (make(64, "g1", command_schedule=schedule) for _ in range(2))
     for epoch, share in ((0, 0.5), (150, 0.75), (200, 1.0)):
         env.enter_epoch(epoch)
         low, high = env.command_ranges["velocity"][:, :4].tolist()
@@ -148,20 +136,17 @@ class Curriculum(Go1Velocity):
         self.command_ranges["velocity"][1, 1] = 0.25
 
 
-def test_a_class_with_its_own_curriculum_keeps_the_schedules_of_costs_and_commands() -> None:
-    schedules = {
-        "cost_schedule": CostSchedule(start=0.1, begin=5, end=9),
-        "command_schedule": CommandSchedule(start=0.5, begin=5, end=9),
-    }
-    env = Curriculum(Curriculum.Settings(name="own", **schedules), PhysicsConfig(), 1, "cpu", 0, None)
+def test_a_class_with_its_own_curriculum_keeps_the_schedule_of_commands() -> None:
+    schedule = CommandSchedule(start=0.5, begin=5, end=9)
+    settings = Curriculum.Settings(name="own", command_schedule=schedule)
+    env = Curriculum(settings, PhysicsConfig(), 1, "cpu", 0, None)
     env.enter_epoch(0)
-    assert env.weighted_terms.shares.amin().item() == pytest.approx(0.1)
     assert env.command_ranges["velocity"][1, :3].tolist() == pytest.approx([1.0, 0.25, 0.35])
 
 
-def test_costs_that_never_rise_are_refused() -> None:
+def test_a_schedule_that_never_rises_is_refused() -> None:
     with pytest.raises(ValueError, match="greater than begin"):
-        CostSchedule(start=0.1, begin=500, end=500)
+        CommandSchedule(start=0.1, begin=500, end=500)
 
 
 @pytest.mark.parametrize("robot", ["go1", "g1"])

@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from msk_ray.config.rewards import reward_section, with_reward
-from msk_ray.config.schedules import CostSchedule, cost_share
 from msk_ray.config.sections import Count, Fraction, NonNegative, Reward, Text
 from msk_ray.config.terms import Term, terms_in
 from msk_ray.robots.config import ServoSettings
@@ -31,9 +30,9 @@ TRACKING_TERMS = terms_in(
     Term("motion_body_ori", 1.0),
     Term("motion_body_lin_vel", 1.0),
     Term("motion_body_ang_vel", 1.0),
-    Term("action_rate_l2", -0.1, schedule=cost_share),
+    Term("action_rate_l2", -0.1),
     Term("joint_limit", -10.0, "msk_ray.robots.terms:dof_pos_limits"),
-    Term("self_collisions", -10.0, "msk_ray.robots.terms:self_collisions", gradient=False, schedule=cost_share),
+    Term("self_collisions", -10.0, "msk_ray.robots.terms:self_collisions", gradient=False),
 )
 MOTION_TERMS = tuple(term.name for term in TRACKING_TERMS if term.name.startswith("motion_"))
 """The terms that measure how close the robot is to the motion; each is at most 1, times its weight."""
@@ -75,8 +74,6 @@ class G1TrackingSettings(ServoSettings):
     foot is far off (`mjlab`), or when the height or tilt of the pelvis is (`pelvis`)."""
     score_failure: Failure = "mjlab"
     """When a scored episode ends early."""
-    cost_schedule: CostSchedule | None = None
-    """Factor on the weights of `action_rate_l2` and `self_collisions` in training; null: 1."""
     reward: TrackingShape = TrackingShape()
 
     @model_validator(mode="after")
