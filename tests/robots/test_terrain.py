@@ -6,9 +6,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from msk_ray.robots.terrain import KINDS, Terrain, noise
+from msk_ray.step.autograd.ground import Ground
+from msk_ray.step.forward import WorldBatch
 
 GROUND = Path(__file__).parents[1] / "fixtures" / "mjlab" / "ground.npz"
 ROWS = 4
@@ -86,3 +89,24 @@ def test_robots_begin_on_the_ground_in_the_middle_of_patches(model: mujoco.MjMod
         foot, down = start + np.array([0.3, -0.2, 1.0]), np.array([0.0, 0.0, -1.0])
         above = mujoco.mj_ray(model, data, foot, down, None, 1, -1, np.zeros(1, np.int32))
         assert 1.0 - 1e-3 <= above < 1.5
+
+
+def test_rays_meet_the_ground_where_those_of_c_mujoco_do(model: mujoco.MjModel) -> None:
+    """Over all patches, their borders and the ground around; 1 mm beside the edges of stairs; high above; within."""
+    rng, reach = np.random.default_rng(2), 3.0
+    starts = Terrain(ROWS).starts.reshape(-1, 3)
+    within = starts[:, None] + rng.uniform([-4.2, -4.2, -0.3], [4.2, 4.2, 1.0], (len(starts), 20, 3))
+    # The edges of the steps, 0.3 m apart, along both axes from the middles of patches.
+    edges = 1.5 + 0.3 * np.repeat(np.arange(6), 2) + np.tile([-1e-3, 1e-3], 6)
+    offset = np.concatenate([np.column_stack(pair) for pair in ((edges, 0 * edges + 0.1), (0 * edges + 0.1, -edges))])
+    beside = starts[:, None] + np.pad(offset, ((0, 0), (0, 1)), constant_values=1.0)
+    around = rng.uniform([-80.0, -80.0, 0.1], [80.0, 80.0, 4.0], (200, 3))
+    points = np.concatenate([part.reshape(-1, 3) for part in (within, beside, around)]).astype(np.float32)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    geom, down = np.zeros(1, np.int32), np.array([0.0, 0.0, -1.0])
+    expected = np.array([mujoco.mj_ray(model, data, p.astype(float), down, None, 1, -1, geom) for p in points])
+    expected[(expected < 0.0) | (expected >= reach)] = reach
+    found = Ground(WorldBatch(model, 1, 1, "cpu")).below(torch.tensor(points)[None], reach)[0]
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    assert (expected == reach).any()

@@ -275,6 +275,17 @@ def test_episodes_end_at_a_low_base_in_training_but_not_in_scores() -> None:
     assert type(env).reference_settings(env.config).termination_height == 0.0
 
 
+def test_a_step_scans_rough_ground_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make_rough(4)
+    counts = []
+    below = env.ground.below
+    monkeypatch.setattr(
+        env.ground, "below", lambda points, reach: counts.append(points.shape[1]) or below(points, reach)
+    )
+    env.step(torch.zeros(4, env.action_size))
+    assert counts.count(len(env.scan_points)) == 1
+
+
 def test_base_height_on_rough_ground_is_measured_from_the_ground_below() -> None:
     env = make(4, "go1")
     rough = make_rough(4, termination_height=0.14)

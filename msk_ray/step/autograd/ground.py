@@ -3,6 +3,7 @@
 Axes: W worlds, R rays.
 """
 
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -40,15 +41,17 @@ class _Distance(torch.autograd.Function):
 
 
 class _Rays:
-    """The launches for R rays in each world."""
+    """The launch of R rays in each world."""
 
-    def __init__(self, batch: WorldBatch, count: int) -> None:
+    def __init__(self, rays: GroundRays, batch: WorldBatch, count: int) -> None:
         self._device = device_of(batch)
-        rays = GroundRays(batch.mjm, batch.model, batch.nworld, count, batch.device)
+        shape = (batch.nworld, count)
+        origin, normal = (wp.zeros(shape, dtype=wp.vec3, device=batch.device) for _ in range(2))
+        distance = wp.zeros(shape, dtype=float, device=batch.device)
         self._origin, self._distance, self._normal = (
-            wp.to_torch(array, requires_grad=False) for array in (rays.origin, rays.distance, rays.normal)
+            wp.to_torch(array, requires_grad=False) for array in (origin, distance, normal)
         )
-        self._graph = Graph(rays.launch, batch.device)
+        self._graph = Graph(lambda: rays.launch(origin, distance, normal), batch.device)
 
     def cast(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (W, R) and normal (W, R, 3) below points (W, R, 3)."""
@@ -68,6 +71,10 @@ class Ground:
         self._batch = batch
         self._rays: dict[int, _Rays] = {}
 
+    @cached_property
+    def _caster(self) -> GroundRays:
+        return GroundRays(self._batch)
+
     def below(self, points: Tensor, reach: float) -> Tensor:
         """How far the ground is straight below points (W, R, 3) [m], (W, R); `reach` where it is not within that.
 
@@ -81,7 +88,7 @@ class Ground:
             raise ConfigError(f"points of {points.shape[0]} worlds, not {self._batch.nworld}: give (W, R, 3)")
         count = points.shape[1]
         if count not in self._rays:
-            self._rays[count] = _Rays(self._batch, count)
+            self._rays[count] = _Rays(self._caster, self._batch, count)
         distance: Tensor = _Distance.apply(self._rays[count], points, reach)
         return distance
 

@@ -29,6 +29,7 @@ from mujoco_warp._src.math import (
     quat_to_vel,
     safe_div,
 )
+from mujoco_warp._src.ray import ray_geom, ray_hfield, ray_mesh
 from mujoco_warp._src.smooth import skip_qacc_smooth
 from mujoco_warp._src.solver import _BLOCK_CHOLESKY_DIM as BLOCK_CHOLESKY_DIM
 from mujoco_warp._src.solver import _cholesky_factorize_solve as cholesky_factorize_solve
@@ -105,6 +106,9 @@ __all__ = [
     "quat_sub",
     "quat_to_mat",
     "quat_to_vel",
+    "ray_geom",
+    "ray_hfield",
+    "ray_mesh",
     "safe_div",
     "skip_qacc_smooth",
     "solve_done",

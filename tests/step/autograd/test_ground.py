@@ -81,6 +81,45 @@ def test_a_scan_and_its_gradient(model: mujoco.MjModel) -> None:
         np.testing.assert_allclose(tangent, slopes, atol=1e-4 * np.abs(slopes).max())
 
 
+SHAPES = """<mujoco><asset><mesh name="wedge" vertex="-1 -1 -.4  1 -1 -.4  -1 1 -.4  1 1 -.4  -1 0 .4  1 0 .4"/></asset>
+<worldbody><geom type="plane" size="1.5 1 1" pos="0 0 -.6"/><geom type="plane" size="0 0 1" pos="0 0 -.9"/>
+<geom type="sphere" size=".5" pos="-3 0 0"/><geom type="capsule" size=".3 .5" euler="60 20 0" pos="-2 2 0"/>
+<geom type="ellipsoid" size=".3 .5 .4" euler="30 0 40" pos="2 1 0"/>
+<geom type="cylinder" size=".3 .6" euler="70 10 0" pos="-2 -2 0"/>
+<geom type="mesh" mesh="wedge" euler="10 20 30" pos="2 -2 0"/><geom type="box" size=".5 .4 .3" euler="0 0 40"/>
+<geom type="box" size=".6 .6 .1" pos=".3 0 .8"/></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def test_every_type_of_geom_is_met_from_above_and_from_within(device: str) -> None:
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    rng = np.random.default_rng(1)
+    points = rng.uniform([-4.0, -3.0, -0.5], [4.0, 3.0, 1.5], (WORLDS, 400, 3)).astype(np.float32)
+    met = np.zeros(1, np.int32)
+    expected, geoms = np.full(points.shape[:2], REACH), set()
+    for at, point in zip(np.ndindex(*expected.shape), points.reshape(-1, 3), strict=True):
+        distance = mujoco.mj_ray(model, data, point.astype(np.float64), [0.0, 0.0, -1.0], None, 1, -1, met)
+        if 0.0 <= distance < REACH:
+            expected[at] = distance
+            geoms.add(int(met[0]))
+    found = Ground(WorldBatch(model, WORLDS, 1, device)).below(torch.tensor(points, device=device), REACH)
+    np.testing.assert_allclose(found.cpu(), expected, atol=1e-5)
+    assert geoms == set(range(model.ngeom))
+    assert (expected == REACH).any()
+
+
+def test_a_geom_is_as_large_as_its_world_says() -> None:
+    model = mujoco.MjModel.from_xml_string(SHAPES)
+    batch = WorldBatch(model, 2, 1, "cpu").with_parameters(["geom_size"])
+    points = torch.tensor([[-3.0, 0.7, 1.0]]).expand(2, 1, 3)
+    sizes = np.tile(model.geom_size.astype(np.float32), (2, 1, 1))
+    sizes[1, 2] = 1.0
+    batch.model.geom_size.assign(sizes)
+    assert Ground(batch).below(points, 3.0).flatten().tolist() == pytest.approx([1.9, 1.0 - 0.51**0.5], abs=1e-5)
+
+
 def test_a_model_without_ground_is_refused() -> None:
     model = mujoco.MjModel.from_xml_string(
         "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"

@@ -45,6 +45,13 @@ SIGNATURES = {
     "quat_sub": "qa quatf, qb quatf -> vec3f",
     "quat_to_mat": "quat quatf -> mat33f",
     "quat_to_vel": "quat quatf -> vec3f",
+    "ray_geom": "pos vec3f, mat mat33f, size vec3f, pnt vec3f, vec vec3f, geomtype int -> (float, vec3f)",
+    "ray_hfield": "geom_dataid array2d[int32], hfield_size array1d[vec4f], hfield_nrow array1d[int32], "
+    "hfield_ncol array1d[int32], hfield_adr array1d[int32], hfield_data array1d[float32], pos vec3f, mat mat33f, "
+    "pnt vec3f, vec vec3f, id int, worldid int -> (float, vec3f)",
+    "ray_mesh": "nmeshface int, mesh_vertadr array1d[int32], mesh_faceadr array1d[int32], mesh_vert array1d[vec3f], "
+    "mesh_face array1d[vec3i], data_id int, pos vec3f, mat mat33f, size vec3f, pnt vec3f, vec vec3f "
+    "-> (float, vec3f)",
     "safe_div": "x Any, y Any -> Any",
     "sphere_box": "sphere_pos vec3f, sphere_radius float, box_pos vec3f, box_rot mat33f, box_size vec3f "
     "-> (float, vec3f, vec3f)",
