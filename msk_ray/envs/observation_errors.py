@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import Spread
+from msk_ray.envs.position_servos import position_servos
 from msk_ray.errors import ConfigError, shortened
 
 UNIFORM_BITS = 24
@@ -72,7 +73,7 @@ class EncoderErrors:
     def __init__(
         self, spreads: Mapping[str, Spread] | None, model: mujoco.MjModel, names: list[str], device: torch.device
     ) -> None:
-        servos = _position_servos(model) if spreads else {}
+        servos = _servos_of_joints(model) if spreads else {}
         joints = sorted(set(servos.values()))
         joint_names = [model.joint(joint).name or str(joint) for joint in joints]
         chosen = dict(sorted(_chosen("encoder_bias", spreads or {}, joint_names, "joint with a position servo")))
@@ -119,18 +120,15 @@ class _Draws:
         return self._sizes * share
 
 
-def _position_servos(model: mujoco.MjModel) -> dict[int, int]:
+def _servos_of_joints(model: mujoco.MjModel) -> dict[int, int]:
     """Number of the joint for the number of each position servo of a hinge or slide joint.
 
     Raises:
         ConfigError: the model has no such servo.
     """
-    gain, kinds = model.actuator_gainprm[:, 0], mujoco.mjtJoint
-    servo = (gain > 0.0) & (model.actuator_biasprm[:, 1] == -gain)
-    servo &= model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
-    servo &= model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    servo = position_servos(model) & (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
     joints = {int(actuator): int(model.actuator_trnid[actuator, 0]) for actuator in servo.nonzero()[0]}
-    single = (int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE))
+    single = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     joints = {actuator: joint for actuator, joint in joints.items() if int(model.jnt_type[joint]) in single}
     if not joints:
         raise ConfigError(

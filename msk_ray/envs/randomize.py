@@ -17,6 +17,7 @@ from torch import Tensor
 from msk_ray.config import Draw, Payload, RandomizeConfig, Shift
 from msk_ray.envs.friction import friction_without_effect
 from msk_ray.envs.generators import seed_stream
+from msk_ray.envs.position_servos import position_servos
 from msk_ray.errors import ConfigError
 
 
@@ -257,7 +258,7 @@ def _chosen(model: mujoco.MjModel, name: str, draw: AnyDraw) -> list[int]:
         base = attrgetter(field.arrays[0])(model)
         rows = [row for row, owner in enumerate(_owners(model, name, range(len(base)))) if owner in wanted]
         if name in _SERVO_COLUMNS:
-            rows = [row for row in rows if model.actuator_biasprm[row, 1]]
+            rows = [row for row in rows if position_servos(model)[row]]
         if not rows:
             raise ConfigError(f"{key}: the model has no {field.element} whose value could be drawn; leave it out")
     _refuse_without_effect(model, name, draw, rows)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.envs.mjcf.env import MjcfEnv
+from msk_ray.envs.position_servos import position_servos
 from msk_ray.errors import ConfigError
 from msk_ray.robots.config import ServoSettings
 from msk_ray.robots.mjcf_check import check_default_pose
@@ -38,8 +39,7 @@ def servos_of(model: mujoco.MjModel) -> list[int]:
     kinds = [mujoco.mjtJoint(kind) for kind in model.jnt_type]
     if kinds[:1] != [mujoco.mjtJoint.mjJNT_FREE] or any(kind != mujoco.mjtJoint.mjJNT_HINGE for kind in kinds[1:]):
         raise ConfigError("a robot needs a model whose first joint is free and whose others are hinges")
-    gain, stiffness = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 1]
-    usable = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)) & (gain > 0.0) & (stiffness > 0.0)
+    usable = position_servos(model) & (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
     usable &= model.actuator_forcerange[:, 1] > 0.0
     servo_of = {int(model.actuator_trnid[servo, 0]): int(servo) for servo in usable.nonzero()[0]}
     for joint in range(1, model.njnt):
