@@ -71,12 +71,7 @@ _REMOVED_FROM_LEGS: dict[str, Any] = {
     "success_speed": 0.8,
     "tracking": {"start": 1.0, "end": 1.0, "epochs": 0},
 }
-_REMOVED_FROM_ROBOTS: dict[str, Any] = {"cost_schedule": None}
 _REMOVED_FROM_ENVS: dict[str, dict[str, Any]] = {
-    "g1_tracking": _REMOVED_FROM_ROBOTS,
-    "g1_velocity": _REMOVED_FROM_ROBOTS,
-    "go1_velocity": _REMOVED_FROM_ROBOTS,
-    "go1_velocity_rough": _REMOVED_FROM_ROBOTS,
     "hopper": {"reward.drop": 200.0, "reward.full_height": -0.3},
     "humanoid": {"reward.drop": 200.0, "reward.full_height": 0.84},
     "myoleg": _REMOVED_FROM_LEGS,

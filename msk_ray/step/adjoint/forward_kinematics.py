@@ -202,8 +202,7 @@ class FrameWalk:
         )
 
     def launch_pullback(self) -> None:
-        """Launch `grad_qpos` and `grad_qvel` of `bars` at `qpos` and `qvel`."""
-        self.launch_forward()
+        """Launch `grad_qpos` and `grad_qvel` of `bars` at `qpos` and `qvel`, whose `frames` are there already."""
         self.grad_qpos.zero_()
         self.grad_qvel.zero_()
         wp.launch(

@@ -37,13 +37,15 @@ class _Walk(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, kinematics: "Kinematics", qpos: Tensor, qvel: Tensor) -> tuple[Tensor, ...]:
         ctx.kinematics = kinematics
-        ctx.save_for_backward(qpos, qvel)
-        return kinematics.evaluate(qpos, qvel)
+        frames = kinematics.evaluate(qpos, qvel)
+        ctx.save_for_backward(qpos, qvel, *frames)
+        return frames
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[None, Tensor, Tensor]:
-        return (None, *ctx.kinematics.pull_back(*ctx.saved_tensors, bars))
+        qpos, qvel, *frames = ctx.saved_tensors
+        return (None, *ctx.kinematics.pull_back(qpos, qvel, frames, bars))
 
 
 class _Constants(NamedTuple):
@@ -105,13 +107,15 @@ class Kinematics:
         return tuple(result.clone() for result in self._results)
 
     @torch.no_grad()
-    def pull_back(self, qpos: Tensor, qvel: Tensor, bars: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """Gradients of raw qpos (W, nq) and of qvel (W, nv) for cotangents of the frames."""
+    def pull_back(
+        self, qpos: Tensor, qvel: Tensor, frames: Sequence[Tensor], bars: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Gradients of raw qpos (W, nq) and of qvel (W, nv) for cotangents of the frames that `evaluate` found."""
         if self._backward is None:
             self._backward = Graph(self._walk.launch_pullback, self._batch_device)
         self._load(qpos, qvel)
-        for view, bar in zip(self._bars, bars, strict=True):
-            view.copy_(bar)
+        for view, value in zip((*self._results, *self._bars), (*frames, *bars), strict=True):
+            view.copy_(value)
         self._backward.replay(stream_of(self._device))
         grad_qpos, grad_qvel = self._gradients
         return grad_qpos.clone(), grad_qvel.clone()
