@@ -47,7 +47,7 @@ class Measurements:
         self._sim, self._owner = sim, owner
         self._replacements = kinematics, tendons, ground
         self._step: tuple[StepState, Tensor] | None = None
-        self._measured: dict[Hashable, tuple[StepState, bool, Any]] = {}
+        self._measured: dict[Hashable, tuple[object, bool, Any]] = {}
         self.ignore_contact_forces = False
 
     def begin(self, reached: StepState, diverged: Tensor) -> None:
@@ -59,8 +59,9 @@ class Measurements:
         self._step = None
         self._measured = {}
 
-    def once(self, what: Hashable, state: StepState, measure: Callable[[], Any]) -> Any:
-        """The result of `measure` for `state`, kept under the key `what` until another state is measured."""
+    def once(self, what: Hashable, state: object, measure: Callable[[], Any]) -> Any:
+        """The result of `measure` for `state`, a state of the physics or of the worlds, kept under the key `what` until
+        another state is measured."""
         grad = torch.is_grad_enabled()
         kept = self._measured.get(what)
         if kept is None or kept[0] is not state or kept[1] != grad:

@@ -55,10 +55,10 @@ def velocity_terms(*others: Term) -> tuple[Term, ...]:
         Term("dof_pos_limits", -1.0),
         Term("action_rate_l2", -0.1),
         Term("air_time", 0.0, gradient=False, optional=True),
-        Term("foot_clearance", -2.0),
-        Term("foot_swing_height", -0.25, gradient=False),
-        Term("foot_slip", -0.1),
-        Term("soft_landing", -1e-5, gradient=False),
+        Term("foot_clearance", -2.0, optional=True),
+        Term("foot_swing_height", -0.25, gradient=False, optional=True),
+        Term("foot_slip", -0.1, optional=True),
+        Term("soft_landing", -1e-5, gradient=False, optional=True),
         *others,
     )
 
@@ -102,8 +102,8 @@ GO1_ROUGH_TERMS = (
     ),
 )
 G1_TERMS = velocity_terms(
-    Term("body_ang_vel", -0.05),
-    Term("angular_momentum", -0.02),
+    Term("body_ang_vel", -0.05, optional=True),
+    Term("angular_momentum", -0.02, optional=True),
     Term("self_collisions", -1.0, gradient=False),
     Term("base_height", 0.0, optional=True),
 )

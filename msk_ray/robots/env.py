@@ -159,6 +159,10 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     def velocity_command(self) -> Tensor:
         """Commanded velocity forward and to the left [m/s], and yaw rate [rad/s], in the current state, (W, 3)."""
+        command: Tensor = self.measurements.once("velocity_command", self.state, self._velocity_command)
+        return command
+
+    def _velocity_command(self) -> Tensor:
         forward, left, turn, heading, *draws = self.command("velocity").unbind(-1)
         stands, goes_ahead, turns = (draw < share for draw, share in zip(draws, _SHARES, strict=True))
         error = heading - quat_yaw(self.state.physics.qpos[:, 3:7])

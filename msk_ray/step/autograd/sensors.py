@@ -169,7 +169,8 @@ class _Mount:
                 )
         self._body = int(body)
         self._bodies = sensors.kinematics.indices("body", (self._body,))
-        self._offset, self._quat = sensors.kinematics.tensor([pos]), sensors.kinematics.tensor(quat)
+        self._offset = sensors.kinematics.tensor([pos])
+        self._quat = None if tuple(quat) == (1.0, 0.0, 0.0, 0.0) else sensors.kinematics.tensor(quat)
 
     def point(self, frames: Frames) -> tuple[Tensor, Tensor]:
         """Its origin [m] and the velocity of that [m/s], each (W, 3)."""
@@ -179,7 +180,7 @@ class _Mount:
     def orientation(self, frames: Frames) -> Tensor:
         """Its orientation, unit quaternions (w, x, y, z), (W, 4)."""
         own = frames.orientation(self._body)
-        return quat_multiply(own, self._quat.expand_as(own))
+        return own if self._quat is None else quat_multiply(own, self._quat.expand_as(own))
 
     def angular_velocity(self, frames: Frames) -> Tensor:
         """Its angular velocity in world coordinates [rad/s], (W, 3)."""
