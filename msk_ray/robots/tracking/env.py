@@ -292,6 +292,13 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
 
     def _observation_of(self, state: StepState, full: bool) -> Tensor:
         """The observation, with the entries that a robot cannot measure if it is `full`."""
+        if state is not self.state.physics:
+            return self._compute_observation(state, full)
+        key = "full observation" if full else "observation"
+        observation: Tensor = self.measurements.once(key, self.state, lambda: self._compute_observation(state, full))
+        return observation
+
+    def _compute_observation(self, state: StepState, full: bool) -> Tensor:
         frames, sensors = self.frames(state), self.sensors(state)
         robot_anchor = frames.position(self.anchor), frames.orientation(self.anchor)
 

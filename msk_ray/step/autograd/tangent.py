@@ -12,17 +12,10 @@ from msk_ray.step.adjoint.stages.integrate import UNIT_ROUNDING
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product of quaternions (w, x, y, z), shape (..., 4)."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    return torch.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        dim=-1,
-    )
+    # By vectors and not by components, because each operation is a kernel of its own on a GPU.
+    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    w = aw * bw - (av * bv).sum(-1, keepdim=True)
+    return torch.cat((w, aw * bv + bw * av + torch.linalg.cross(av, bv)), dim=-1)
 
 
 def quat_conjugate(q: Tensor) -> Tensor:
