@@ -17,10 +17,10 @@ from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.evaluate.targets import REFERENCE, trial_folder_of
 from msk_ray.evaluate.zoo import BEGIN, BEST_EVALUATION, END, MAX_BYTES, Entry, Training, read_zoo, score_of, zoo_text
 from msk_ray.experiment.checkpoint_format import write_checkpoint_file
-from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, best_checkpoint
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.provenance import read_environment
 from msk_ray.experiment.snapshot import read_trial
 from msk_ray.export.network import CHECKED, compare, observations, to_torchscript
 from msk_ray.export.write import policy_to_control
