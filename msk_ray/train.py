@@ -286,7 +286,7 @@ def _train(
     if math.isfinite(trainer.best_score):
         untrained = _untrained_score(logdir)
         beside = "" if untrained is None else f" (untrained {untrained:.1f})"
-        print(f"best evaluation score {trainer.best_score:.1f}{beside}: {trainer.best_checkpoint}")
+        print(f"best score of a trained policy {trainer.best_score:.1f}{beside}: {trainer.best_checkpoint}")
         if untrained is not None and untrained >= trainer.best_score:
             print("no trained policy scored higher than the first one: by this score, nothing was learned")
     else:
