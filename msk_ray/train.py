@@ -27,10 +27,10 @@ from msk_ray.cli import TERMINAL_LOG, Parser, run, surviving_closed_output, type
 from msk_ray.compiling import announce_compiling
 from msk_ray.config import SET_HELP, Config, load_config
 from msk_ray.errors import CheckpointError, ConfigError, StorageError
-from msk_ray.experiment.environment import environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.ownership import Ownership, owned
+from msk_ray.experiment.provenance import environment
 from msk_ray.files import check_writable, make_folder, write_json
 from msk_ray.metrics import SCORE
 from msk_ray.progress import ProgressLine, announce
@@ -286,7 +286,7 @@ def _train(
     if math.isfinite(trainer.best_score):
         untrained = _untrained_score(logdir)
         beside = "" if untrained is None else f" (untrained {untrained:.1f})"
-        print(f"best evaluation score {trainer.best_score:.1f}{beside}: {trainer.best_checkpoint}")
+        print(f"best score of a trained policy {trainer.best_score:.1f}{beside}: {trainer.best_checkpoint}")
         if untrained is not None and untrained >= trainer.best_score:
             print("no trained policy scored higher than the first one: by this score, nothing was learned")
     else:

@@ -12,7 +12,7 @@ from scenes import cartpole
 
 import msk_ray
 from msk_ray.errors import ConfigError, StorageError
-from msk_ray.experiment.environment import read_environment
+from msk_ray.experiment.provenance import read_environment
 
 
 def test_importing_loads_neither_torch_nor_warp() -> None:

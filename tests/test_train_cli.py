@@ -84,7 +84,7 @@ def test_what_is_waited_for_and_what_was_not_learned_is_said(
         "shac.horizon.epochs is epoch 20, but training ends at trial.epochs, 2: the schedule stays unfinished"
     )
     assert "scoring the first policy in 4 worlds, then training ..." in lines
-    assert lines[-3].startswith("best evaluation score 9.0 (untrained 10.0): ")
+    assert lines[-3].startswith("best score of a trained policy 9.0 (untrained 10.0): ")
     assert lines[-2].startswith("no trained policy scored higher than the first one")
 
 

@@ -15,9 +15,9 @@ from fault_campaign.tally import Tally
 from msk_ray.experiment import layout
 from msk_ray.experiment.attempts import Attempt, WorldReduction, load_attempt
 from msk_ray.experiment.checkpoint_format import read_checkpoint_file, write_checkpoint_file
+from msk_ray.experiment.evaluation_log import EvaluationLog, LogEntry
 from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
-from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.files import write_json, write_text
 from msk_ray.training.loggers.jsonl import JsonLines
 
@@ -113,7 +113,7 @@ def _writers(old: bytes, new: bytes) -> list[Writer]:
 
     def journal(folder: Path, some: list[LogEntry]) -> None:
         for report in some:
-            SchedulerLog(folder / layout.SCHEDULER_LOG_FILE).append(report)
+            EvaluationLog(folder / layout.EVALUATION_LOG_FILE).append(report)
 
     return [
         checkpoint("best.pt"),
@@ -152,9 +152,9 @@ def _writers(old: bytes, new: bytes) -> list[Writer]:
             lambda f: load_metrics(f / layout.METRICS_FILE).rows,
         ),
         Writer(
-            f"{layout.SCHEDULER_LOG_FILE}, a report added",
+            f"{layout.EVALUATION_LOG_FILE}, a report added",
             lambda f: journal(f, reports[:2]),
             lambda f: journal(f, reports[2:]),
-            lambda f: SchedulerLog(f / layout.SCHEDULER_LOG_FILE).read(),
+            lambda f: EvaluationLog(f / layout.EVALUATION_LOG_FILE).read(),
         ),
     ]

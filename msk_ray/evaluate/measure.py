@@ -14,7 +14,7 @@ from msk_ray.envs import env_class
 from msk_ray.envs.randomize import Randomizer
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.targets import OWN, REFERENCE
-from msk_ray.experiment.environment import installed_versions
+from msk_ray.experiment.provenance import installed_versions
 from msk_ray.progress import Pace
 from msk_ray.training import Evaluator, SavedPolicy
 from msk_ray.training.episodes import Episodes

@@ -5,7 +5,7 @@ from pathlib import Path
 MANIFEST_FILE = "manifest.json"
 SPACE_FILE = "space.yaml"
 ENVIRONMENT_FILE = "env.json"
-SCHEDULER_LOG_FILE = "reports.jsonl"
+EVALUATION_LOG_FILE = "reports.jsonl"
 SUMMARY_FILE = "summary.json"
 """Written by a driver, with the table, when it ends normally."""
 NOTES_FILE = "notes.json"

@@ -25,11 +25,11 @@ from msk_ray.cli import option_value, typed_command, with_option
 from msk_ray.config import current_values, parse_recorded
 from msk_ray.errors import ConfigError, StorageError, StorageFailure, brief
 from msk_ray.experiment.damage import CATALOGUE, DamagedFile, field, read_object, texts
-from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, METRICS_FILE, OUTCOME_FILE, STOP_FILE
 from msk_ray.experiment.metrics import read_metrics
 from msk_ray.experiment.outcomes import Outcome, read_ending
 from msk_ray.experiment.ownership import Ownership, owned
+from msk_ray.experiment.provenance import read_environment
 from msk_ray.experiment.trial import Trial
 from msk_ray.files import check_writable, make_folder, write_json
 

@@ -9,7 +9,8 @@ import mujoco
 import msk_ray
 from msk_ray.envs import Env
 from msk_ray.errors import ConfigError
-from msk_ray.export.network import CHECKED, TOLERANCE, PolicyToControl
+from msk_ray.export.compare import CHECKED, TOLERANCE
+from msk_ray.export.network import PolicyToControl
 from msk_ray.training import SavedPolicy
 
 FORMAT = 2

@@ -9,15 +9,10 @@ import numpy as np
 
 from msk_ray.envs import Env, env_class, make_env
 from msk_ray.evaluate.measure import named_physics
+from msk_ray.export.compare import CHECKED, WORLDS, compare_with_checkpoint, observations
 from msk_ray.export.description import describe
 from msk_ray.export.formats import FORMATS
-from msk_ray.export.network import (
-    CHECKED,
-    WORLDS,
-    PolicyToControl,
-    compare,
-    observations,
-)
+from msk_ray.export.network import PolicyToControl
 from msk_ray.files import write_bytes, write_json
 from msk_ray.training import SavedPolicy, load_policy
 
@@ -40,7 +35,7 @@ def export(checkpoint: Path, paths: Mapping[str, Path], physics: str) -> Iterato
     checked = {}
     for name in paths:
         payload, runner = FORMATS[name].write(policy, *inputs)
-        checked[name] = payload, compare(policy, runner, env, *inputs)
+        checked[name] = payload, compare_with_checkpoint(policy, runner, env, *inputs)
     descriptions: dict[Path, dict[str, str]] = {}
     for name, path in paths.items():
         payload, difference = checked[name]

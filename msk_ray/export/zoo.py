@@ -17,12 +17,13 @@ from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.evaluate.targets import REFERENCE, trial_folder_of
 from msk_ray.evaluate.zoo import BEGIN, BEST_EVALUATION, END, MAX_BYTES, Entry, Training, read_zoo, score_of, zoo_text
 from msk_ray.experiment.checkpoint_format import write_checkpoint_file
-from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, best_checkpoint
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
+from msk_ray.experiment.provenance import read_environment
 from msk_ray.experiment.snapshot import read_trial
-from msk_ray.export.network import CHECKED, compare, observations, to_torchscript
+from msk_ray.export.compare import CHECKED, compare_with_checkpoint, observations
+from msk_ray.export.network import to_torchscript
 from msk_ray.export.write import policy_to_control
 from msk_ray.files import make_folder, write_bytes, write_text
 from msk_ray.training import SavedPolicy, load_policy
@@ -203,7 +204,7 @@ def _parity(stored: SavedPolicy) -> float:
     policy, env, _ = policy_to_control(stored, REFERENCE)
     seed = stored.config.evaluation.seed
     inputs = policy.examples(observations(env, seed), seed)
-    return compare(policy, to_torchscript(policy, *inputs)[1], env, *inputs)
+    return compare_with_checkpoint(policy, to_torchscript(policy, *inputs)[1], env, *inputs)
 
 
 def _update_table(folder: Path) -> str:

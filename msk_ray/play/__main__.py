@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 from msk_ray.cli import STORAGE, Parser, geom_group_list, port_number, positive, run
 from msk_ray.compiling import announce_compiling
-from msk_ray.config import Config, load_config, parse_config
+from msk_ray.config import ENVIRONMENTS, Config, load_config, parse_config
 from msk_ray.errors import ConfigError, DeviceError
 from msk_ray.evaluate.targets import REFERENCE, best_checkpoint, find_target
 from msk_ray.play import NO_DISPLAY
-from msk_ray.shipped import POLICIES, find_shipped
+from msk_ray.shipped import POLICIES, find_shipped, shipped_names
 from msk_ray.sweep.space import parse_seeds
 from msk_ray.tasks import Task, find_task
 
@@ -34,6 +34,7 @@ active. To make films and pictures, use msk-ray visualize."""
 
 EXAMPLES = """\
   python -m msk_ray.play ant                             # its best policy in policies/
+  python -m msk_ray.play go1_velocity_robust             # a policy in policies/ by its name
   python -m msk_ray.play go1_velocity --agent zero       # what does the model do by itself?
   python -m msk_ray.play my_robot:Robot --agent random   # a class of yours
   python -m msk_ray.play --agent runs/demo --browser     # the best policy of an experiment"""
@@ -46,7 +47,10 @@ def parser() -> Parser:
     """The command line."""
     p = Parser("python -m msk_ray.play", DESCRIPTION, EXAMPLES)
     p.add_argument(
-        "task", nargs="?", metavar="TASK", help="a task (default: the task of the policy that --agent names)"
+        "task",
+        nargs="?",
+        metavar="TASK",
+        help="a task, or the name of a policy in policies/ (default: the task of the policy that --agent names)",
     )
     p.add_argument(
         "--agent",
@@ -89,6 +93,7 @@ def parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
+    _take_policy(args)
     _check(args)
     task = None if args.task is None else find_task(args.task)
     checkpoint = _checkpoint(args, task)
@@ -129,6 +134,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             print()
     return 0
+
+
+def _take_policy(args: argparse.Namespace) -> None:
+    """Where TASK is no task but the name of a policy in `policies/`, take it as --agent."""
+    if args.task not in shipped_names(POLICIES, ".pt") or ENVIRONMENTS.find(args.task) is not None:
+        return
+    if args.agent != ZOO:
+        raise ConfigError(f"{args.task} is a policy in policies/, not a task: leave --agent out, or name its task")
+    args.task, args.agent = None, args.task
 
 
 def _check(args: argparse.Namespace) -> None:

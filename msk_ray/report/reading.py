@@ -13,10 +13,10 @@ from typing import Any
 from msk_ray.config import parse_settings
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.experiment.damage import Damage, DamagedFile, count_damages, describe_damages, read_text
-from msk_ray.experiment.environment import read_environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, MANIFEST_FILE, OUTPUT_FILE, SPACE_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.notes import load_notes
+from msk_ray.experiment.provenance import read_environment
 from msk_ray.experiment.records import ExperimentReader, TrialRecord, best_record, records_by_environment
 from msk_ray.experiment.snapshot import State
 from msk_ray.experiment.trial import Trial

@@ -23,8 +23,8 @@ from msk_ray.robots.config import (
 )
 from msk_ray.robots.mjcf_check import GROUND, missing, missing_parts
 from msk_ray.robots.robot import by_joint
-from msk_ray.robots.robots import G1, GO1
 from msk_ray.robots.servos import ServoEnv
+from msk_ray.robots.unitree import G1, GO1
 from msk_ray.step import StepState
 from msk_ray.step.autograd.contact_state import AirTime, Contact
 from msk_ray.step.autograd.tangent import quat_conjugate, quat_multiply, quat_rotate, quat_yaw

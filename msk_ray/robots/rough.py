@@ -11,9 +11,9 @@ from msk_ray.config import PhysicsConfig
 from msk_ray.envs.layout import Entry, entries
 from msk_ray.robots.config import GO1_ROUGH_TERMS, ROUGH_VELOCITY, Go1VelocityRoughSettings
 from msk_ray.robots.env import VelocityEnv
-from msk_ray.robots.robots import GO1
 from msk_ray.robots.terms import COLLISION_FORCE
 from msk_ray.robots.terrain import KINDS, Terrain
+from msk_ray.robots.unitree import GO1
 from msk_ray.step import StepState
 from msk_ray.step.autograd.ground import grid
 from msk_ray.step.autograd.tangent import quat_rotate

@@ -7,9 +7,9 @@ from typing import Any
 from msk_ray.config import dump_yaml
 from msk_ray.errors import MskRayError, StorageError
 from msk_ray.experiment.damage import read_settings
-from msk_ray.experiment.environment import environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE, SPACE_FILE
 from msk_ray.experiment.manifest import Experiment, refuse_old
+from msk_ray.experiment.provenance import environment
 from msk_ray.experiment.trial import Trial, describe_changes
 from msk_ray.files import check_writable, make_folder, write_json, write_text
 from msk_ray.sweep.extend import extend_trials

@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from msk_ray.experiment.environment import installed_versions, read_environment
 from msk_ray.experiment.layout import ENVIRONMENT_FILE
+from msk_ray.experiment.provenance import installed_versions, read_environment
 from msk_ray.files import write_json
 from msk_ray.nvidia_smi import ask_driver
 

@@ -1,4 +1,4 @@
-"""`python -m msk_ray.tune`: an experiment of many trials, one GPU each, with Ray Tune."""
+"""`python -m msk_ray.tune`: an experiment of many trials with Ray Tune, each on GPUs, a share of one, or CPUs."""
 
 if __name__ == "__main__":
     # Set up before the slow imports.

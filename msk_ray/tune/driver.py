@@ -21,13 +21,13 @@ from msk_ray.config import Config, parse_recorded, value_at
 from msk_ray.errors import ClusterLost, MskRayError, OwnershipLost, StorageFailure, storage_failure
 from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.damage import describe_damages, read_settings
-from msk_ray.experiment.layout import SCHEDULER_LOG_FILE
+from msk_ray.experiment.evaluation_log import EvaluationLog
+from msk_ray.experiment.layout import EVALUATION_LOG_FILE
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import last_figures
 from msk_ray.experiment.outcomes import read_ending, write_ending
 from msk_ray.experiment.ownership import Ownership
 from msk_ray.experiment.records import read_record
-from msk_ray.experiment.scheduler_log import SchedulerLog
 from msk_ray.experiment.trial import Trial, by_environment
 from msk_ray.progress import announce, format_duration
 from msk_ray.signals import StopRequest, listening
@@ -141,8 +141,8 @@ def run_trials(plan: Plan) -> bool:
         return not stop
 
 
-def _journal(plan: Plan) -> SchedulerLog:
-    return SchedulerLog(plan.experiment.path / SCHEDULER_LOG_FILE, plan.guard)
+def _journal(plan: Plan) -> EvaluationLog:
+    return EvaluationLog(plan.experiment.path / EVALUATION_LOG_FILE, plan.guard)
 
 
 def _finish_pruning(plan: Plan) -> None:

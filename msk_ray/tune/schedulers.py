@@ -6,8 +6,8 @@ from typing import Any
 
 from ray.tune.schedulers import FIFOScheduler, PopulationBasedTraining, TrialScheduler
 
+from msk_ray.experiment.evaluation_log import EvaluationLog, LogEntry
 from msk_ray.experiment.outcomes import Ending
-from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.sweep.operators import Operator, Range
 from msk_ray.sweep.rules.population import PopulationBasedTraining as PopulationSpec
 from msk_ray.sweep.rules.scheduler import Pruner
@@ -28,7 +28,7 @@ class PruningScheduler(FIFOScheduler):
         self,
         pruner: Pruner,
         time_attr: str,
-        journal: SchedulerLog,
+        journal: EvaluationLog,
         identify: Callable[[Any], str],
         on_stop: Callable[[str, Ending], None],
     ) -> None:

@@ -1,4 +1,5 @@
-"""Run one trial from its current state to its end. Independent of Ray, for use in a debugger."""
+"""Run one trial from its current state to its end, also after its process was killed. Independent of Ray, for use in a
+debugger."""
 
 import bdb
 import math

@@ -1,1 +1,1 @@
-"""Watch a policy: viewer, videos and film strips, drawn by C MuJoCo from trajectories of the simulator."""
+"""Pictures of a policy: videos and film strips, drawn by C MuJoCo from trajectories of the simulator."""

@@ -20,12 +20,12 @@ from msk_ray.errors import MskRayError, StorageFailure
 from msk_ray.experiment import damage
 from msk_ray.experiment.attempts import Attempt, WorldReduction, load_attempt
 from msk_ray.experiment.damage import DamagedFile, read_object
+from msk_ray.experiment.evaluation_log import EvaluationLog, LogEntry
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, read_ending, write_ending
 from msk_ray.experiment.records import ExperimentReader, read_records
 from msk_ray.experiment.results_table import summary, table_document
-from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.experiment.snapshot import State, read_trial
 from msk_ray.report.reading import read_experiment
 from msk_ray.sweep import opening
@@ -87,8 +87,8 @@ def test_lines_among_which_others_are_put_are_all_found(others: list[tuple[int, 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "reports.jsonl"
         path.write_bytes(b"\n".join(lines) + b"\n" + b'{"trial": "a", "epoch": 9, "env'[:torn])
-        entries, damages = SchedulerLog(path).read()
-        again = SchedulerLog(path).read()
+        entries, damages = EvaluationLog(path).read()
+        again = EvaluationLog(path).read()
     assert [report for report in entries if report in reports] == reports
     assert len(entries) + len(damages) == sum(len(line.split(b"\n")) for line in lines)
     assert again == (entries, damages)

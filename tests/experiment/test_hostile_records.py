@@ -23,12 +23,12 @@ from msk_ray.experiment import layout
 from msk_ray.experiment.attempts import Attempt, WorldReduction
 from msk_ray.experiment.checkpoint_format import read_checkpoint_file, read_facts, write_checkpoint_file
 from msk_ray.experiment.damage import CATALOGUE, DEPTH, LINE, read_object
+from msk_ray.experiment.evaluation_log import EvaluationLog, LogEntry
 from msk_ray.experiment.manifest import MAX_TRIALS, Experiment
 from msk_ray.experiment.metrics import load_metrics
 from msk_ray.experiment.notes import load_notes, write_note
 from msk_ray.experiment.outcomes import Ending, Outcome, load_ending, write_ending
 from msk_ray.experiment.ownership import LOCK_FILE, acquire, has_living_owner
-from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.files import append_text
 from msk_ray.report.__main__ import main as report
 from msk_ray.report.best import stored_best
@@ -49,7 +49,7 @@ OF_A_TRIAL = (
 )
 OF_THE_EXPERIMENT = (
     *(layout.MANIFEST_FILE, layout.SPACE_FILE, layout.ENVIRONMENT_FILE, layout.NOTES_FILE, layout.SUMMARY_FILE),
-    *(layout.SCHEDULER_LOG_FILE, LOCK_FILE),
+    *(layout.EVALUATION_LOG_FILE, LOCK_FILE),
 )
 RECORDS = (*OF_A_TRIAL, *OF_THE_EXPERIMENT)
 
@@ -82,7 +82,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
         Attempt(WorldReduction(8, 4, "no room", cleared=True)).write(own)
         write_ending(own, Ending(Outcome.FINISHED, "all 4 epochs done"))
         write_note(made.path, trial.id, "mine")
-    SchedulerLog(made.path / layout.SCHEDULER_LOG_FILE).append(LogEntry("a", 1, 10, 0.5, 1.0, False))
+    EvaluationLog(made.path / layout.EVALUATION_LOG_FILE).append(LogEntry("a", 1, 10, 0.5, 1.0, False))
     (made.path / layout.SUMMARY_FILE).write_text("{}")
     return made
 

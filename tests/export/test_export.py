@@ -24,8 +24,9 @@ from msk_ray.errors import ConfigError, ExportError
 from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.export import network
 from msk_ray.export.__main__ import main
+from msk_ray.export.compare import largest_difference, observations
 from msk_ray.export.description import describe
-from msk_ray.export.network import PolicyToControl, largest_difference
+from msk_ray.export.network import PolicyToControl
 from msk_ray.shipped import shipped_folder
 from msk_ray.step import StepState
 
@@ -163,7 +164,7 @@ def test_controls_that_depend_on_the_state_are_left_out(env: CartPole) -> None:
 def test_controls_that_depend_on_the_action_before_take_it_as_an_input(env: CartPole) -> None:
     smoothed = Smoothed(env.config, PhysicsConfig(), 4, "cpu", 0, None)
     policy = PolicyToControl(torch.nn.Sequential(torch.nn.Linear(5, 1), torch.nn.Tanh()), smoothed).eval()
-    inputs = policy.examples(network.observations(smoothed, 0), 0)
+    inputs = policy.examples(observations(smoothed, 0), 0)
     for write in (network.to_onnx, network.to_torchscript):
         run_exported = write(policy, *inputs)[1]
         assert largest_difference(policy, run_exported, *inputs) <= 1e-5

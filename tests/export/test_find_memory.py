@@ -13,7 +13,8 @@ from msk_ray.envs.cartpole.env import CartPole
 from msk_ray.envs.memory import Memory
 from msk_ray.errors import ExportError
 from msk_ray.export import network
-from msk_ray.export.network import PolicyToControl, difference_over_steps, largest_difference
+from msk_ray.export.compare import difference_over_steps, largest_difference, observations
+from msk_ray.export.network import PolicyToControl
 from msk_ray.step import StepState
 
 pytestmark = pytest.mark.long
@@ -90,7 +91,7 @@ def test_what_it_can_carry_is_inside_and_the_rest_is_given() -> None:
     assert [each.start.tolist() for each in policy.carried] == [[0.25], [0.0], [0.0, 0.0]]
     assert policy.remarks == ["entries of obs depend on 'height', which the file cannot carry: give them too"]
     assert not env.measurements.ignore_contact_forces
-    inputs = policy.examples(network.observations(env, 0), 0)
+    inputs = policy.examples(observations(env, 0), 0)
     for write in (network.to_onnx, network.to_torchscript):
         run = write(policy, *inputs)[1]
         assert largest_difference(policy, run, *inputs) <= 1e-5

@@ -2,11 +2,13 @@
 
 import os
 import re
+import shutil
 import socket
 import subprocess
 import sys
 import urllib.request
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import mujoco
@@ -143,6 +145,7 @@ def test_a_display_that_does_not_open_is_no_display(env: Env, monkeypatch: pytes
             "policies/ has no policy for myosuite_walk: write --agent zero, random, or a policy's path",
         ),
         (["ant", "--agent", "cartpole", "--device", "cpu"], "acts in the task cartpole, not in ant: leave TASK out"),
+        (["ant_hard", "--agent", "zero"], "ant_hard is a policy in policies/, not a task: leave --agent out"),
         (["--agent", "gone.pt"], "no checkpoint, trial or experiment 'gone.pt'"),
     ],
 )
@@ -153,6 +156,31 @@ def test_tasks_and_agents_that_do_not_fit_are_refused(
     assert main(["play", *arguments]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_a_policy_is_played_by_its_name_in_place_of_a_task(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also one of the user's own, in the current folder."""
+    policies = tmp_path / "policies"
+    policies.mkdir()
+    shutil.copy(root / "policies" / "cartpole.pt", policies / "swinger.pt")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DISPLAY", ":99")
+    screens: list[Screenshots] = []
+
+    def screen(args: object, model: mujoco.MjModel, groups: object) -> AbstractContextManager[Screen]:
+        screens.append(Screenshots(model, 10))
+        return nullcontext(screens[-1])
+
+    monkeypatch.setattr("msk_ray.play.__main__._screen", screen)
+    words = ["--device", "cpu", "--episodes", "1", "--steps", "3", "--speed", "1000"]
+    assert main(["play", "swinger", *words]) == 0
+    said = capsys.readouterr().out
+    assert f"playing {policies / 'swinger.pt'}" in said
+    assert "episode 1: score" in said
+    (shown,) = screens
+    assert len(shown.shown) == 3
 
 
 @pytest.fixture

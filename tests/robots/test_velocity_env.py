@@ -19,10 +19,10 @@ from msk_ray.errors import ConfigError
 from msk_ray.robots.config import G1_TERMS, GO1_TERMS
 from msk_ray.robots.env import Go1Velocity, VelocityEnv
 from msk_ray.robots.robot import PoseSpread, by_joint
-from msk_ray.robots.robots import GO1
 from msk_ray.robots.rough import Go1VelocityRough
 from msk_ray.robots.servos import servos_of
 from msk_ray.robots.terms import base_height, upright, variable_posture
+from msk_ray.robots.unitree import GO1
 from msk_ray.step import StepState
 
 SCENES = Path(__file__).parents[2] / "msk_ray" / "robots" / "scenes"

@@ -5,9 +5,9 @@ import math
 import pytest
 
 from msk_ray.errors import ConfigError
+from msk_ray.experiment.evaluation_log import LogEntry
 from msk_ray.experiment.metrics import Evaluation, evaluations_of
 from msk_ray.experiment.outcomes import Outcome
-from msk_ray.experiment.scheduler_log import LogEntry
 from msk_ray.sweep.rules.asha import Asha, SuccessiveHalving
 from msk_ray.sweep.rules.median import Median, MedianStopping
 from msk_ray.sweep.rules.plateau import Plateau

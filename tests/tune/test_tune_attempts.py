@@ -14,12 +14,12 @@ from msk_ray.config import dump_yaml, read_yaml
 from msk_ray.errors import ConfigError
 from msk_ray.experiment import attempts
 from msk_ray.experiment.attempts import FIRST, Attempt, WorldReduction, read_attempt
-from msk_ray.experiment.layout import ABANDONED, SCHEDULER_LOG_FILE
+from msk_ray.experiment.evaluation_log import EvaluationLog, LogEntry
+from msk_ray.experiment.layout import ABANDONED, EVALUATION_LOG_FILE
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.outcomes import Ending, Outcome, read_ending, write_ending
 from msk_ray.experiment.records import read_records
 from msk_ray.experiment.results_table import reduced_note, result_rows, summary, table_document, variant_rows
-from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.experiment.trial import Trial
 from msk_ray.signals import RESUMABLE
 from msk_ray.sweep import opening
@@ -257,7 +257,7 @@ def test_a_stop_that_was_not_carried_out_is_void_once_the_worlds_are_halved(
     good, bad = (trial.id for trial in trials)
     experiment.trial_folder(bad).mkdir()
     for name, score in ((good, 2.0), (bad, 1.0)):  # at the rung, half of 20 epochs × 64 env steps
-        SchedulerLog(experiment.path / SCHEDULER_LOG_FILE).append(LogEntry(name, 10, 640, 1.0, score, False))
+        EvaluationLog(experiment.path / EVALUATION_LOG_FILE).append(LogEntry(name, 10, 640, 1.0, score, False))
     if halved_after:
         Attempt(WorldReduction(8, 4, "no room")).write(experiment.trial_folder(bad))
     driver._finish_pruning(driver.Plan(experiment, space, trials, Placement(0.0, 1), None))

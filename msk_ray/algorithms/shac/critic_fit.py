@@ -42,7 +42,7 @@ class CriticFit:
         group: Group = ALONE,
     ) -> None:
         on_cpu = next(critic.parameters()).device.type == "cpu"
-        self._gradient = _ByHand(critic, group) if on_cpu else _Batched(critic, group)
+        self._gradient: _Gradient = _ByHand(critic, group) if on_cpu else _Batched(critic, group)
         self._grad_norm = grad_norm
         self._tolerance = tolerance
         self._group = group

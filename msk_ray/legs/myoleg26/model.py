@@ -1,4 +1,4 @@
-"""`myoleg26`: two legs of 13 Hill-type muscles each under one trunk, from the tables in `myoleg26_tables`.
+"""`myoleg26`: two legs of 13 Hill-type muscles each under one trunk, from the tables in `tables.py`.
 
 The pelvis moves on three slides and three hinges, so qpos is 18 numbers without a quaternion: x, height and -y of the
 pelvis [m], its tilt, list and rotation [rad], then hip flexion, adduction, rotation, knee, ankle, toes of the right leg

@@ -14,10 +14,10 @@ from msk_ray.envs.layout import Entry, each, entries, vector
 from msk_ray.envs.memory import Memory
 from msk_ray.envs.records import EnvState, Transition
 from msk_ray.errors import ConfigError
-from msk_ray.robots.robots import G1
 from msk_ray.robots.servos import ServoEnv
 from msk_ray.robots.tracking.config import TRACKING_TERMS, G1TrackingSettings
 from msk_ray.robots.tracking.references import Library, Reference, References, Source, StartFrames, library_of
+from msk_ray.robots.unitree import G1
 from msk_ray.step import StepState
 from msk_ray.step.autograd.tangent import quat_conjugate, quat_log, quat_multiply, quat_rotate, quat_yaw
 

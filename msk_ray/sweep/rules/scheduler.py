@@ -10,8 +10,8 @@ from pydantic import Field
 
 from msk_ray.config.sections import Section, Text
 from msk_ray.errors import ConfigError
+from msk_ray.experiment.evaluation_log import LogEntry
 from msk_ray.experiment.outcomes import Ending
-from msk_ray.experiment.scheduler_log import LogEntry
 
 if TYPE_CHECKING:
     from msk_ray.sweep.space import SpaceFile

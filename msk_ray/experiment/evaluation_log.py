@@ -1,7 +1,8 @@
 """Log of the evaluations given to the early-stopping rule, in their order.
 
 The trials' own records contain neither the order across trials nor which of their last rows had reached the driver when
-it died. And a rule must not get an evaluation twice: it would compare it again, with more trials.
+it died. And a rule must not get an evaluation twice: it would compare it again, with more trials. What the rule decides
+is in the outcome.json of each trial, written by `tune/supervisor.py`.
 """
 
 import json
@@ -34,7 +35,7 @@ class LogEntry:
         return Evaluation(self.epoch, self.env_steps, self.seconds, self.score).time(attribute)
 
 
-class SchedulerLog:
+class EvaluationLog:
     """The log of an experiment, one JSON object per line."""
 
     def __init__(self, path: Path, guard: Callable[[], None] = lambda: None) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from msk_ray.experiment.evaluation_log import EvaluationLog, LogEntry
 from msk_ray.experiment.outcomes import Ending
-from msk_ray.experiment.scheduler_log import LogEntry, SchedulerLog
 from msk_ray.sweep import opening
 from msk_ray.sweep.rules.asha import Asha
 from msk_ray.sweep.rules.median import Median
@@ -28,7 +28,7 @@ class Driver:
     """The scheduler of one driver's life over stub trials that report in turn."""
 
     def __init__(self, spec: SchedulerSpec, path: Path) -> None:
-        journal = SchedulerLog(path)
+        journal = EvaluationLog(path)
         pruner = spec.pruner(100 * EPOCHS)
         replay(pruner, spec.time_attr, journal.read()[0])
         self.stopped: dict[str, tuple[int, str]] = {}
@@ -97,7 +97,7 @@ def test_a_stop_that_was_decided_but_not_carried_out_is_found(tmp_path: Path) ->
 
 
 def test_a_torn_end_is_cut_off(tmp_path: Path) -> None:
-    journal = SchedulerLog(tmp_path / "j")
+    journal = EvaluationLog(tmp_path / "j")
     report = LogEntry("a", 1, 100, 0.5, 2.0, False)
     journal.append(report)
     with (tmp_path / "j").open("a") as file:

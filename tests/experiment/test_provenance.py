@@ -2,7 +2,7 @@
 
 from importlib import metadata
 
-from msk_ray.experiment.environment import installed_versions
+from msk_ray.experiment.provenance import installed_versions
 
 
 def test_what_is_not_installed_is_left_out() -> None:

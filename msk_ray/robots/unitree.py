@@ -1,4 +1,7 @@
-"""Unitree's Go1 and G1. Source: `mjlab/tasks/velocity/config` of mjlab 1.6.0."""
+"""Unitree's Go1 and G1. Source: `mjlab/tasks/velocity/config` of mjlab 1.6.0.
+
+Action scales are computed from the models' servos (`servos.py`).
+"""
 
 from typing import Final
 
