@@ -3,6 +3,7 @@
 Axes: W worlds.
 """
 
+from collections import deque
 from collections.abc import Callable, Hashable
 from functools import cached_property
 from typing import Any
@@ -21,7 +22,7 @@ from msk_ray.step.forward.contact_watch import FIGURES
 
 
 class Measurements:
-    """Measures states of a simulation, and keeps each quantity until another state is measured.
+    """Measures states of a simulation, and keeps each quantity for the two states that were measured last.
 
     Contact forces and the readings of some sensors belong to the step that led to a state. They have no gradient, and
     are 0 in a world that diverged.
@@ -47,7 +48,7 @@ class Measurements:
         self._sim, self._owner = sim, owner
         self._replacements = kinematics, tendons, ground
         self._step: tuple[StepState, Tensor] | None = None
-        self._measured: dict[Hashable, tuple[object, bool, Any]] = {}
+        self._measured: dict[Hashable, deque[tuple[object, bool, Any]]] = {}
         self.ignore_contact_forces = False
 
     def begin(self, reached: StepState, diverged: Tensor) -> None:
@@ -60,13 +61,18 @@ class Measurements:
         self._measured = {}
 
     def once(self, what: Hashable, state: object, measure: Callable[[], Any]) -> Any:
-        """The result of `measure` for `state`, a state of the physics or of the worlds, kept under the key `what` until
-        another state is measured."""
+        """The result of `measure` for `state`, of the physics or of the worlds, kept under the key `what`.
+
+        Two are kept, because a step goes back and forth between the state that it starts from and the one it reaches.
+        """
         grad = torch.is_grad_enabled()
-        kept = self._measured.get(what)
-        if kept is None or kept[0] is not state or kept[1] != grad:
-            kept = self._measured[what] = (state, grad, measure())
-        return kept[2]
+        kept = self._measured.setdefault(what, deque(maxlen=2))
+        for measured, with_grad, result in kept:
+            if measured is state and with_grad == grad:
+                return result
+        result = measure()
+        kept.append((state, grad, result))
+        return result
 
     def frames(self, state: StepState) -> Frames:
         """As `Env.frames`."""

@@ -189,6 +189,12 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     def base_velocities(self, state: StepState) -> tuple[Tensor, Tensor]:
         """Velocity [m/s] and angular velocity [rad/s] of the base in its own axes, each (W, 3)."""
+        velocities: tuple[Tensor, Tensor] = self.measurements.once(
+            "base_velocities", state, lambda: self._base_velocities(state)
+        )
+        return velocities
+
+    def _base_velocities(self, state: StepState) -> tuple[Tensor, Tensor]:
         frames, base = self.frames(state), self.robot.base
         into_base = quat_conjugate(frames.orientation(base))
         return quat_rotate(into_base, frames.velocity(base)), quat_rotate(into_base, frames.angular_velocity(base))
