@@ -8,7 +8,7 @@ from torch import Tensor
 
 from msk_ray import Memory, StepState
 from msk_ray.envs.cartpole.env import CartPole
-from msk_ray.envs.layout import Entry, remembered
+from msk_ray.envs.layout import Entry, known
 
 DISTURBANCES: dict[str, Any] = {
     "observation_noise": {"cart_*": {"uniform": 0.5}, "pole_rate": {"normal": 0.2}},
@@ -35,4 +35,4 @@ class Recalling(CartPole):
 
     def observation_layout(self) -> list[Entry]:
         frame = super().observation_layout()
-        return [*frame, *remembered(frame * 2)]
+        return [*frame, *known(frame * 2)]

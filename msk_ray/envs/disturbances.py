@@ -4,7 +4,7 @@ delays of observations and controls (`delays.py`), and pushes (`pushes.py`).
 All of them are functions of numbers drawn when an episode begins, of the episode's age, and of memories. A step draws
 nothing, so the same state always gives the same observation.
 
-Axes: W worlds, O observation, M measured entries of the observation (all but remembered ones), D numbers drawn for an
+Axes: W worlds, O observation, M measured entries of the observation (all but known ones), D numbers drawn for an
 episode.
 """
 
@@ -61,7 +61,7 @@ class Disturbances:
         self.seed(seed)
         layout = _layout(config, env)
         self._layout_size = len(layout)
-        measured = [column for column, entry in enumerate(layout) if not entry.remembered]
+        measured = [column for column, entry in enumerate(layout) if not entry.known]
         names = [layout[column].name for column in measured]
         self._measured = None if len(measured) == len(layout) else torch.tensor(measured, device=env.device)
         self._noise = EntryErrors("observation_noise", config.observation_noise, names, env.device)

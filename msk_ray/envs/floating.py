@@ -4,7 +4,7 @@ from typing import Any, ClassVar, TypeVar
 
 from torch import Tensor
 
-from msk_ray.envs.layout import Entry, each, entries, vector
+from msk_ray.envs.layout import Entry, each, entries, known, vector
 from msk_ray.envs.limited_body import LimitedBody
 from msk_ray.envs.limited_settings import FallingSettings
 from msk_ray.step import StepState
@@ -31,7 +31,7 @@ class FloatingBody(LimitedBody[FallingT]):
             *each(hinges, "angle", "rad"),
             *each(hinges, "rate", "10 rad/s"),
             *entries(self.cosine_names),
-            *entries(f"last_action_{i}" for i in range(self.action_size)),
+            *known(entries(f"last_action_{i}" for i in range(self.action_size))),
         ]
 
     def fell(self, state: StepState) -> Tensor:

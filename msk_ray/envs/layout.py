@@ -11,8 +11,9 @@ class Entry(NamedTuple):
     name: str
     unit: str
     """Unit of the number as observed, after any scaling; empty if it has none."""
-    remembered: bool = False
-    """Whether the number comes from a memory; errors and delays of observations then do not change it."""
+    known: bool = False
+    """Whether the policy knows the number without measuring it: its last action, a command, a memory. Errors and delays
+    of observations do not change it."""
 
 
 def entries(names: Iterable[str], unit: str = "") -> list[Entry]:
@@ -20,9 +21,9 @@ def entries(names: Iterable[str], unit: str = "") -> list[Entry]:
     return [Entry(name, unit) for name in names]
 
 
-def remembered(layout: Iterable[Entry]) -> list[Entry]:
-    """The same entries, marked as coming from a memory, such as the frames of a history."""
-    return [entry._replace(remembered=True) for entry in layout]
+def known(layout: Iterable[Entry]) -> list[Entry]:
+    """The same entries, marked as known without measuring, such as the frames of a history."""
+    return [entry._replace(known=True) for entry in layout]
 
 
 def each(names: Iterable[str], what: str, unit: str = "") -> list[Entry]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
 from msk_ray.config.physics import CONTACTS
-from msk_ray.envs.layout import Entry, each, entries
+from msk_ray.envs.layout import Entry, each, entries, known
 from msk_ray.errors import ConfigError
 from msk_ray.legs.assistance import Assistance, AssistedEnv
 from msk_ray.legs.config import OUT_OF_PLANE, TERMS, AssistConfig, LegSettings
@@ -160,9 +160,9 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
             *each(muscles, "fibre_length", "optimal lengths"),
             *each(muscles, "fibre_rate", "largest shortening speeds"),
             *each(muscles, "force", "peak isometric forces"),
-            *each(muscles, "last_action"),
-            Entry("target_speed", "m/s"),
-            *entries(f"clock_{part}" for part in (("cos", "sin") if self.config.clock else ())),
+            *known(each(muscles, "last_action")),
+            *known(entries(("target_speed",), "m/s")),
+            *known(entries(f"clock_{part}" for part in (("cos", "sin") if self.config.clock else ()))),
         ]
 
     def action_names(self) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from msk_ray.envs.layout import Entry, each, entries, vector
+from msk_ray.envs.layout import Entry, each, entries, known, vector
 from msk_ray.envs.memory import Memory
 from msk_ray.errors import ConfigError
 from msk_ray.robots.config import (
@@ -268,9 +268,9 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
             *vector("gravity"),
             *each(self.joint_names, "angle", "rad"),
             *each(self.joint_names, "rate", "rad/s"),
-            *entries(f"{joint}_action" for joint in self.joint_names),
-            *entries(("command_forward", "command_left"), "m/s"),
-            Entry("command_yaw_rate", "rad/s"),
+            *known(entries(f"{joint}_action" for joint in self.joint_names)),
+            *known(entries(("command_forward", "command_left"), "m/s")),
+            *known(entries(("command_yaw_rate",), "rad/s")),
         ]
 
 

@@ -28,10 +28,17 @@ from msk_ray.step import StepState
 SCENES = Path(__file__).parents[2] / "msk_ray" / "robots" / "scenes"
 
 
-def make(nworld: int, robot: str = "go1", *, differentiable: bool = False, **changes: Any) -> VelocityEnv[Any]:
+def make(
+    nworld: int,
+    robot: str = "go1",
+    *,
+    differentiable: bool = False,
+    physics: PhysicsConfig | None = None,
+    **changes: Any,
+) -> VelocityEnv[Any]:
     name = f"{robot}_velocity"
     settings = settings_class(name)(name=name, **changes)
-    env = make_env(settings, PhysicsConfig(), nworld, "cpu", 0, differentiable=differentiable)
+    env = make_env(settings, physics or PhysicsConfig(), nworld, "cpu", 0, differentiable=differentiable, randomize=True)
     assert isinstance(env, VelocityEnv)
     return env
 
@@ -114,6 +121,19 @@ def test_a_pose_tail_gives_pose_terms_a_slope_in_training_but_not_in_scores() ->
             value = term(env, end, end.qpos, end.qpos).item()
             assert value == pytest.approx((1.0 - share) * math.exp(-x) + share / (1.0 + x), rel=1e-4)
     assert type(tailed).reference_settings(tailed.config).reward.pose_tail == 0.0
+
+
+def test_late_observations_show_the_last_action_and_the_command_of_now() -> None:
+    """The policy does not measure what it did and what it is asked to do."""
+    late = PhysicsConfig(randomize={"observation_delay": [1, 1]})
+    env = make(2, physics=late)
+    env.step(torch.full((2, env.action_size), 0.25))
+    before = env.observe(env.state.physics, env.state.action)
+    env.step(torch.full((2, env.action_size), 0.5))
+    now = env.observe(env.state.physics, env.state.action)
+    known = torch.tensor([entry.known for entry in env.observation_layout()])
+    assert int(known.sum()) == env.action_size + 3
+    assert torch.equal(env.observation(), torch.where(known, now, before))
 
 
 def test_commands_widen_in_training_but_not_in_scores() -> None:

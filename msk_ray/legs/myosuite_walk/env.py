@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.layout import Entry, each, entries, vector
+from msk_ray.envs.layout import Entry, each, entries, known, vector
 from msk_ray.legs.assistance import Assistance, AssistedEnv, FreeSprings
 from msk_ray.legs.clock import fourier
 from msk_ray.legs.config import AssistConfig
@@ -236,7 +236,7 @@ class MyoSuiteWalk(AssistedEnv[MyoSuiteWalkSettings]):
             *each(_FEET, "height", "m"),
             Entry("center_of_mass_height", "m"),
             *(entry for foot in _FEET for entry in vector(f"{foot}_from_pelvis", "m")),
-            Entry("phase", "turns"),
+            *known(entries(("phase",), "turns")),
             *each(muscles, "length", "m"),
             *each(muscles, "velocity", "m/s"),
             *each(muscles, "force", "kN"),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from msk_ray.config import PhysicsConfig
-from msk_ray.envs.layout import Entry, each, entries, vector
+from msk_ray.envs.layout import Entry, each, entries, known, vector
 from msk_ray.envs.memory import Memory
 from msk_ray.envs.records import EnvState, Transition
 from msk_ray.errors import ConfigError
@@ -327,8 +327,8 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
 
         def reference_entries(suffix: str) -> list[Entry]:
             return [
-                *each(self.joint_names, f"reference{suffix}", "rad"),
-                *each(self.joint_names, f"reference_rate{suffix}", "rad/s"),
+                *known(each(self.joint_names, f"reference{suffix}", "rad")),
+                *known(each(self.joint_names, f"reference_rate{suffix}", "rad/s")),
                 *(vector(f"anchor_position{suffix}", "m") if full else ()),
                 *entries(f"anchor_orientation{suffix}_{row}{column}" for row in "xyz" for column in "xy"),
             ]
@@ -339,7 +339,7 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
             *vector("imu_angular_velocity", "rad/s"),
             *each(self.joint_names, "angle", "rad"),
             *each(self.joint_names, "rate", "rad/s"),
-            *entries(f"{joint}_action" for joint in self.joint_names),
+            *known(entries(f"{joint}_action" for joint in self.joint_names)),
             *(entry for ahead in self.config.future_frames for entry in reference_entries(f"_{ahead}")),
         ]
 
