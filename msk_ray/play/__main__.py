@@ -100,7 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     announce_compiling(f"playing {checkpoint or f'{args.task} with {args.agent} actions'}")
     from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.play.agents import random_policy, zero_policy
-    from msk_ray.play.episodes import play_episodes
+    from msk_ray.play.live import play_episodes
     from msk_ray.step.autograd.simulation import resolve_device
     from msk_ray.training import load_policy
     from msk_ray.visualize.look import describe_groups, geom_groups
