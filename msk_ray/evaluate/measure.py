@@ -19,7 +19,7 @@ from msk_ray.progress import Pace
 from msk_ray.training import Evaluator, SavedPolicy
 from msk_ray.training.evaluation_tally import Episodes
 from msk_ray.training.machine import device_name
-from msk_ray.training.out_of_memory import named_out_of_memory
+from msk_ray.training.named_out_of_memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
 DISTURBED = "disturbed"
