@@ -24,7 +24,7 @@ from msk_ray.status import main as status
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import load_space
 
-OF_A_TRIAL = (layout.METRICS_FILE, layout.OUTCOME_FILE, layout.DEVICE_FILE, layout.HALVED_FILE, "config.yaml")
+OF_A_TRIAL = (layout.METRICS_FILE, layout.OUTCOME_FILE, layout.DEVICE_FILE, layout.ATTEMPT_FILE, "config.yaml")
 OF_THE_EXPERIMENT = (layout.MANIFEST_FILE, layout.ENVIRONMENT_FILE, layout.SPACE_FILE, layout.SUMMARY_FILE)
 ODD = (b"", b"null", b"7", b"[]", b"{}", b"\xff\xfe", bytes(64), b"[" * 9999, b'{"epoch": 1e400}', b'{"epoch": 1')
 TIMES = 3
@@ -88,7 +88,7 @@ def _experiment(reference: Reference, scratch: Path) -> Experiment:
         (folder / "config.yaml").write_text(dump_yaml(trial.config.as_dict()))
         write_json(folder / layout.DEVICE_FILE, {"host": "h", "visible": "", "count": 0, "name": "cpu"})
         halved = {"asked": 8, "worlds": 4, "why": "for the sake of damage", "cleared": True}
-        write_json(folder / layout.HALVED_FILE, halved)
+        write_json(folder / layout.ATTEMPT_FILE, halved)
         write_ending(folder, Ending(Outcome.FINISHED, f"all {EPOCHS} epochs done"))
     write_json(made.path / layout.SUMMARY_FILE, {})
     return made

@@ -134,7 +134,7 @@ def _writers(old: bytes, new: bytes) -> list[Writer]:
             load_ending,
         ),
         Writer(
-            layout.HALVED_FILE,
+            layout.ATTEMPT_FILE,
             lambda f: Attempt(WorldReduction(8, 4, "old")).write(f),
             lambda f: Attempt(WorldReduction(8, 4, "old", cleared=True)).write(f),
             load_attempt,

@@ -1,4 +1,6 @@
-"""Measures what a state holds: frames of bodies, tendons, sensors, contacts and the ground.
+"""What environments measure of a state, each quantity computed once: frames, tendons, sensors, contacts and the ground.
+
+How each is computed is in `step.autograd`, in a file of its own.
 
 Axes: W worlds.
 """

@@ -1,4 +1,4 @@
-"""Pushes in training: sudden changes of velocity.
+"""Pushes in training, drawn at random: sudden changes of velocity.
 
 Axes: W worlds.
 """

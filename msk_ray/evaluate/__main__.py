@@ -15,7 +15,7 @@ from msk_ray.errors import CheckpointError, ConfigError, MskRayError
 from msk_ray.evaluate import zoo
 from msk_ray.evaluate.foreign_scoring import SCORINGS, Scorer, find_python, foreign_scoring
 from msk_ray.evaluate.stored import FORMAT, eval_file_of, store_evaluation
-from msk_ray.evaluate.targets import REFERENCE, Kind, Target, best_checkpoint, best_of_trial, find_target
+from msk_ray.evaluate.targets import REFERENCE, Kind, Target, best_of_trial, checkpoint_of, find_target
 from msk_ray.evaluate.vary import HELP, parse_vary, vary_text
 from msk_ray.experiment.attempts import read_attempt
 from msk_ray.experiment.checkpoint_format import read_facts
@@ -110,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if target.kind is Kind.ZOO:
         return _evaluate_zoo(target, args)
     if target.kind is not Kind.EXPERIMENT:
-        best_checkpoint(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
+        checkpoint_of(target)  # torch and Warp take seconds to load; a wrong path should not wait for them
     announce_compiling(f"evaluating {_description(target)}")
 
     from msk_ray.evaluate import measure
@@ -171,7 +171,7 @@ def _evaluate_zoo(target: Target, args: argparse.Namespace) -> int:
 def _description(target: Target) -> str:
     """What is evaluated, for the line that announces it."""
     if target.kind is not Kind.EXPERIMENT:
-        return str(best_checkpoint(target))
+        return str(checkpoint_of(target))
     return f"the best policy of each of the {len(Experiment(target.path).trials())} trials of {target.path}"
 
 
@@ -196,7 +196,7 @@ def _evaluate_one(target: Target, scorer: Scorer, requests: "Sequence[Request]",
     """Evaluate one policy, and print one table for each group of successive requests."""
     from msk_ray.training import load_policy
 
-    path = best_checkpoint(target)
+    path = checkpoint_of(target)
     policy = load_policy(path)
     for request in requests:
         scorer.check(policy.config, request)

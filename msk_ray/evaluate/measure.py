@@ -17,9 +17,9 @@ from msk_ray.evaluate.targets import OWN, REFERENCE
 from msk_ray.experiment.provenance import installed_versions
 from msk_ray.progress import Pace
 from msk_ray.training import Evaluator, SavedPolicy
-from msk_ray.training.episodes import Episodes
+from msk_ray.training.evaluation_tally import Episodes
 from msk_ray.training.machine import device_name
-from msk_ray.training.out_of_memory import named_out_of_memory
+from msk_ray.training.named_out_of_memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
 DISTURBED = "disturbed"

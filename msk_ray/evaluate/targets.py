@@ -78,7 +78,7 @@ def find_experiment(text: str, storage: Path) -> Experiment:
     return Experiment(target.path)
 
 
-def best_checkpoint(target: Target) -> Path:
+def checkpoint_of(target: Target) -> Path:
     """The checkpoint that a target stands for: the target itself, a trial's best, or the best trial's best.
 
     Raises:
@@ -125,7 +125,7 @@ def best_of_trial(folder: Path) -> Path:
     Raises:
         CheckpointError: there is none yet.
     """
-    path = layout.best_checkpoint(folder)
+    path = layout.best_checkpoint_in(folder)
     if not path.is_file():
         raise CheckpointError(
             f"{folder} has no checkpoints/{path.name}: the trial has not been evaluated yet, or the file was lost"

@@ -13,7 +13,7 @@ from typing import Any
 from msk_ray.config import overlay, parse_config
 from msk_ray.errors import ConfigError, StorageFailure
 from msk_ray.experiment.damage import DamagedFile, field, read_object
-from msk_ray.experiment.layout import ABANDONED, EVAL_FILE, HALVED_FILE, METRICS_FILE
+from msk_ray.experiment.layout import ABANDONED, ATTEMPT_FILE, EVAL_FILE, METRICS_FILE
 from msk_ray.experiment.trial import Trial
 from msk_ray.files import write_json, write_text
 
@@ -131,7 +131,7 @@ class Attempt:
             StorageFailure: the disk is full or gone.
         """
         assert self.reduction is not None  # the first needs no file
-        write_json(folder / HALVED_FILE, vars(self.reduction))
+        write_json(folder / ATTEMPT_FILE, vars(self.reduction))
 
 
 FIRST = Attempt()
@@ -144,7 +144,7 @@ def load_attempt(folder: Path) -> Attempt:
         DamagedFile: its file cannot be used.
         StorageFailure: the storage cannot be read.
     """
-    return read_object(folder / HALVED_FILE, _attempt) or FIRST
+    return read_object(folder / ATTEMPT_FILE, _attempt) or FIRST
 
 
 def read_attempt(folder: Path) -> Attempt:

@@ -16,7 +16,8 @@ STOP_FILE = "stop"
 CONFIG_FILE = "config.yaml"
 METRICS_FILE = "metrics.jsonl"
 OUTCOME_FILE = "outcome.json"
-HALVED_FILE = "halved.json"
+ATTEMPT_FILE = "halved.json"
+"""Which attempt the folder holds; only the second, which has half the worlds, has this file."""
 DEVICE_FILE = "device.json"
 PARAMS_FILE = "params.json"
 EVAL_FILE = "eval.json"
@@ -27,6 +28,6 @@ ABANDONED = "abandoned"
 """Subfolder of a trial that was restarted with half its worlds, with the files of its first attempt."""
 
 
-def best_checkpoint(folder: Path) -> Path:
+def best_checkpoint_in(folder: Path) -> Path:
     """Path of the best policy of the trial in `folder`."""
     return folder / "checkpoints" / "best.pt"

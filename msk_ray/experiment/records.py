@@ -11,10 +11,10 @@ from msk_ray.config import current_key, parse_recorded, value_at
 from msk_ray.errors import MskRayError
 from msk_ray.experiment.damage import Damage, cut, read_settings
 from msk_ray.experiment.layout import (
+    ATTEMPT_FILE,
     CONFIG_FILE,
     DEVICE_FILE,
     ENVIRONMENT_FILE,
-    HALVED_FILE,
     MANIFEST_FILE,
     METRICS_FILE,
     OUTCOME_FILE,
@@ -26,7 +26,7 @@ from msk_ray.experiment.snapshot import State, TrialReader, TrialSnapshot, file_
 from msk_ray.experiment.trial import Trial, by_environment
 from msk_ray.text import describe
 
-_READ = (METRICS_FILE, OUTCOME_FILE, HALVED_FILE, DEVICE_FILE, OUTPUT_FILE)
+_READ = (METRICS_FILE, OUTCOME_FILE, ATTEMPT_FILE, DEVICE_FILE, OUTPUT_FILE)
 """A trial is read again when one of these files changes."""
 _ORDER = [State.RUNNING, State.STALE, State.INTERRUPTED, State.ENDED, State.WAITING]
 

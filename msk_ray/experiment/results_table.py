@@ -22,8 +22,8 @@ def result_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
 
 
 def variant_rows(records: Sequence[TrialRecord]) -> list[tuple[str, ...]]:
-    """One row per variant of one environment, highest mean first: number of seeds, and mean, standard deviation,
-    minimum and maximum of their best scores."""
+    """One row of texts per variant of one environment, highest mean first: number of seeds, and mean, standard
+    deviation, minimum and maximum of their best scores."""
     groups: dict[str, list[TrialRecord]] = {}
     for record in records:
         groups.setdefault(record.trial.variant, []).append(record)

@@ -19,7 +19,7 @@ from msk_ray.experiment.layout import (
     METRICS_FILE,
     OUTPUT_FILE,
     SUMMARY_FILE,
-    best_checkpoint,
+    best_checkpoint_in,
 )
 from msk_ray.experiment.metrics import (
     Evaluation,
@@ -135,7 +135,7 @@ class TrialSnapshot:
     @property
     def best_checkpoint(self) -> Path | None:
         """Checkpoint of the best evaluation's policy, or of the untrained one before; None if it is missing."""
-        path = best_checkpoint(self.folder)
+        path = best_checkpoint_in(self.folder)
         return path if path.is_file() else None
 
     @property

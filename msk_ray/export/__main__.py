@@ -9,7 +9,7 @@ from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.config.packages import require
 from msk_ray.errors import ConfigError
-from msk_ray.evaluate.targets import REFERENCE, best_checkpoint, find_target
+from msk_ray.evaluate.targets import REFERENCE, checkpoint_of, find_target
 from msk_ray.export.formats import FORMATS
 from msk_ray.files import make_folder
 from msk_ray.sweep.space import parse_seeds
@@ -74,7 +74,7 @@ def parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
-    checkpoint = best_checkpoint(find_target(args.target, args.storage))
+    checkpoint = checkpoint_of(find_target(args.target, args.storage))
     paths = {name: path for name in FORMATS if (path := getattr(args, name)) is not None}
     if args.zoo is not None:
         return _add_to_zoo(args, checkpoint, bool(paths))

@@ -17,7 +17,7 @@ from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.evaluate.targets import REFERENCE, trial_folder_of
 from msk_ray.evaluate.zoo import BEGIN, BEST_EVALUATION, END, MAX_BYTES, Entry, Training, read_zoo, score_of, zoo_text
 from msk_ray.experiment.checkpoint_format import write_checkpoint_file
-from msk_ray.experiment.layout import ENVIRONMENT_FILE, best_checkpoint
+from msk_ray.experiment.layout import ENVIRONMENT_FILE, best_checkpoint_in
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.metrics import read_rows
 from msk_ray.experiment.provenance import read_environment
@@ -114,10 +114,10 @@ def _training(saved: SavedPolicy, given: Origin) -> Training:
     for name, value in (("command", command), ("commit", commit), ("machine", machine)):
         if not value:
             raise ConfigError(f"{folder} does not say with which {name} it was trained: add --{name} TEXT")
-    chosen = given.chosen or (BEST_EVALUATION if saved.path.name == best_checkpoint(folder).name else None)
+    chosen = given.chosen or (BEST_EVALUATION if saved.path.name == best_checkpoint_in(folder).name else None)
     if not chosen:
         raise ConfigError(
-            f"{saved.path.name} is not the {best_checkpoint(folder).name} of its trial: say how it was chosen with "
+            f"{saved.path.name} is not the {best_checkpoint_in(folder).name} of its trial: say how it was chosen with "
             '--chosen TEXT, such as "the newest checkpoint"'
         )
     assert command is not None

@@ -26,8 +26,8 @@ from msk_ray.legs.gait.measure import measure, summary
 from msk_ray.legs.metabolic import muscle_masses, total_power
 from msk_ray.legs.mirror import Mirror, check_mirrored, leg_mirrors
 from msk_ray.legs.muscles import MuscleCurves, columns
-from msk_ray.legs.push import pushed
 from msk_ray.legs.reference import Reference
+from msk_ray.legs.regular_pushes import pushed
 from msk_ray.legs.root import Root
 from msk_ray.step import StepState
 

@@ -13,7 +13,7 @@ from msk_ray.cli import STORAGE, Parser, geom_group_list, port_number, positive,
 from msk_ray.compiling import announce_compiling
 from msk_ray.config import ENVIRONMENTS, Config, load_config, parse_config
 from msk_ray.errors import ConfigError, DeviceError
-from msk_ray.evaluate.targets import REFERENCE, best_checkpoint, find_target
+from msk_ray.evaluate.targets import REFERENCE, checkpoint_of, find_target
 from msk_ray.play import NO_DISPLAY
 from msk_ray.shipped import POLICIES, find_shipped, shipped_names
 from msk_ray.sweep.space import parse_seeds
@@ -100,7 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     announce_compiling(f"playing {checkpoint or f'{args.task} with {args.agent} actions'}")
     from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.play.agents import random_policy, zero_policy
-    from msk_ray.play.episodes import play_episodes
+    from msk_ray.play.live import play_episodes
     from msk_ray.step.autograd.simulation import resolve_device
     from msk_ray.training import load_policy
     from msk_ray.visualize.look import describe_groups, geom_groups
@@ -171,7 +171,7 @@ def _checkpoint(args: argparse.Namespace, task: Task | None) -> Path | None:
     if args.agent in (ZERO, RANDOM):
         return None
     if args.agent != ZOO:
-        return best_checkpoint(find_target(args.agent, args.storage))
+        return checkpoint_of(find_target(args.agent, args.storage))
     assert task is not None
     if task.best is None:
         raise ConfigError(f"policies/ has no policy for {task.name}: write --agent zero, random, or a policy's path")

@@ -29,10 +29,10 @@ from msk_ray.report.tables import (
     VariantRow,
     baseline_of,
     by_variant_and_environment,
+    compare_variants,
     failures,
     outcome_counts,
     outcome_figures,
-    variant_rows,
 )
 from msk_ray.text import printable
 
@@ -245,7 +245,7 @@ def _templates() -> Environment:
         failures=failures,
         outcome_counts=outcome_counts,
         outcome_figures=outcome_figures,
-        variant_rows=variant_rows,
+        compare_variants=compare_variants,
     )
     environment.filters.update(
         number=_number, signed=_signed, percent=_percent, duration=format_duration, steps=format_steps

@@ -110,8 +110,9 @@ def outcome_figures(trials: Sequence[TrialRecord]) -> list[str]:
     return [name for name in short if "/" not in name and name not in _PLAIN_FIGURES]
 
 
-def variant_rows(reading: Reading, baseline: str | None) -> list[VariantRow]:
-    """One row per variant, the highest mean first, those without a score last."""
+def compare_variants(reading: Reading, baseline: str | None) -> list[VariantRow]:
+    """One row per variant, compared with the baseline if there is one, the highest mean first, those without a score
+    last."""
     groups = reading.variants
     reference = groups[baseline] if baseline is not None else []
     names = outcome_figures(reading.trials)
@@ -190,7 +191,7 @@ def _mean_of(rows: Sequence[Mapping[str, float]], name: str) -> float | None:
 
 def by_variant_and_environment(parts: Sequence[Reading]) -> dict[str, list[VariantRow | None]]:
     """Each variant's row in each part of an experiment, in the experiment's order; None where it has no trial."""
-    rows = [{row.variant: row for row in variant_rows(part, None)} for part in parts]
+    rows = [{row.variant: row for row in compare_variants(part, None)} for part in parts]
     names = dict.fromkeys(variant for part in parts for variant in part.variants)
     return {name: [by_variant.get(name) for by_variant in rows] for name in names}
 

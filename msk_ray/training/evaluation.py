@@ -13,7 +13,7 @@ from msk_ray.envs.generators import GlobalGenerators
 from msk_ray.envs.records import Resets
 from msk_ray.errors import ConfigError
 from msk_ray.step import StepState
-from msk_ray.training.episodes import Episodes, Tally
+from msk_ray.training.evaluation_tally import Episodes, Tally
 from msk_ray.training.policy_group import Policy, PolicyGroup, streams_for
 from msk_ray.training.recorded_evaluation import RecordedStep, recorded_step
 

@@ -15,7 +15,7 @@ from msk_ray.errors import CheckpointError
 from msk_ray.group import ALONE, Group
 from msk_ray.training.checkpoint import read_checkpoint
 from msk_ray.training.determinism import use_determinism
-from msk_ray.training.out_of_memory import named_out_of_memory
+from msk_ray.training.named_out_of_memory import named_out_of_memory
 from msk_ray.training.threads import use_threads
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from msk_ray.envs import Env
 from msk_ray.step.autograd.capture import Recording, fill
-from msk_ray.training.episodes import Tally
+from msk_ray.training.evaluation_tally import Tally
 from msk_ray.training.policy_group import PolicyGroup
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from msk_ray.config import Config
+from msk_ray.experiment.layout import best_checkpoint_in
 
 
 class TrialFolder:
@@ -27,7 +28,7 @@ class TrialFolder:
     @property
     def best_checkpoint(self) -> Path:
         """Checkpoint of the policy with the best evaluation score."""
-        return self.checkpoints / "best.pt"
+        return best_checkpoint_in(self.logdir)
 
     @property
     def finished(self) -> bool:

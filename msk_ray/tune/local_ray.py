@@ -1,4 +1,4 @@
-"""Our own Ray on this machine, and its access from outside: ports, token, dashboard."""
+"""How our own Ray on this machine is started, and its access from outside: ports, token, dashboard."""
 
 import os
 import secrets

@@ -1,6 +1,7 @@
-"""`python -m msk_ray.tune.ray_probe`: start Ray as a sweep does, run one task, and print the result as JSON.
+"""`python -m msk_ray.tune.ray_probe`: whether Ray starts as for a sweep, for `msk-ray doctor`.
 
-A separate process, because a time limit on Ray's start can only be enforced from outside.
+It runs one task and prints the result as JSON. A separate process, because a time limit on Ray's start can only be
+enforced from outside.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""The Ray session that trials run in: our own on this machine, or a running cluster."""
+"""The Ray session of a sweep, from start to end: our own on this machine (`local_ray`), or a running cluster."""
 
 import os
 import socket

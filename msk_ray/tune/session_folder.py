@@ -1,4 +1,4 @@
-"""The folder of our own Ray session, which only its owner can enter, and which is always removed.
+"""The folder of the files of our own Ray, which only its owner can enter, and which is always removed.
 
 Ray creates its folders with mode 0777, and trusts the sockets, logs and service files in them. So it gets a folder
 inside one that other users of the machine cannot enter.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from msk_ray.cli import STORAGE, Parser, geom_group_list, positive, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import CheckpointError, ConfigError
-from msk_ray.evaluate.targets import REFERENCE, Target, best_checkpoint, best_trial_folder, find_target
+from msk_ray.evaluate.targets import REFERENCE, Target, best_trial_folder, checkpoint_of, find_target
 from msk_ray.files import make_folder
 from msk_ray.progress import Pace, announce
 from msk_ray.sweep.space import parse_seeds
@@ -123,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     bench = Bench(device, tell=True)
     if args.progression is not None:
         return _progression(args, target, bench, Request(args.physics, 1, seeds, args.steps))
-    policy = load_policy(best_checkpoint(target))
+    policy = load_policy(checkpoint_of(target))
     from msk_ray.visualize.episodes import record
     from msk_ray.visualize.render import check_camera
 
@@ -151,7 +151,7 @@ def _check(args: argparse.Namespace) -> Target:
     if args.seed is not None:
         parse_seeds(args.seed)
     target = find_target(given, args.storage)
-    best_checkpoint(target)
+    checkpoint_of(target)
     drawing = args.video or args.save_frames or args.strip or args.progression is not None
     if not drawing and not args.no_render:
         raise ConfigError(
@@ -191,7 +191,7 @@ def _what(args: argparse.Namespace, target: Target) -> str:
         return f"an episode of each policy that {best_trial_folder(target)} saved during training"
     count = args.episodes or (10 if args.no_render else 1)
     number = "1 episode" if count == 1 else f"{count} episodes at once"
-    return f"{number} of {best_checkpoint(target)}"
+    return f"{number} of {checkpoint_of(target)}"
 
 
 def episode_table(recording: "Recording") -> str:
@@ -270,7 +270,7 @@ def _progression(args: argparse.Namespace, target: Target, bench: "Bench", reque
     image, rows = progression(bench, folder, request, args.frames or PROGRESSION_FRAMES, view)
     if image is None:
         raise CheckpointError(f"{folder / 'checkpoints'} has no policies saved during training (policy_*.pt)")
-    _say_groups(args, bench.evaluator(load_policy(best_checkpoint(target)).config, request)[0].env.model)
+    _say_groups(args, bench.evaluator(load_policy(checkpoint_of(target)).config, request)[0].env.model)
     save_image(image, out)
     print("\n".join(rows))
     print(f"{len(rows)} policies of {folder} in {out}")

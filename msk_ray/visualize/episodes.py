@@ -10,7 +10,7 @@ from torch import Tensor
 from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.step import StepState
 from msk_ray.training import SavedPolicy
-from msk_ray.training.episodes import Episodes
+from msk_ray.training.evaluation_tally import Episodes
 from msk_ray.visualize.render import States
 
 

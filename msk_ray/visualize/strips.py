@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from msk_ray.evaluate.measure import Bench, Request
-from msk_ray.experiment.layout import best_checkpoint
+from msk_ray.experiment.layout import best_checkpoint_in
 from msk_ray.training import load_policy
 from msk_ray.training.checkpoint import milestones
 from msk_ray.visualize.episodes import Recording, record
@@ -42,7 +42,7 @@ def progression(
     paths = [path for _, path in milestones(folder)]
     if not paths:
         return None, []
-    best = best_checkpoint(trial)
+    best = best_checkpoint_in(trial)
     policies = [load_policy(path) for path in paths]
     if best.is_file():
         policies.append(load_policy(best))

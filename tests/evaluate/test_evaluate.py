@@ -23,7 +23,7 @@ from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.records import best_records, read_records
 from msk_ray.training import Trainer, load_policy, read_metrics
 from msk_ray.training.checkpoint import milestones
-from msk_ray.training.episodes import Episodes
+from msk_ray.training.evaluation_tally import Episodes
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 from bodies import make_bodies
 
 from msk_ray.errors import CheckpointError, ConfigError
-from msk_ray.evaluate.targets import Kind, Target, best_checkpoint
+from msk_ray.evaluate.targets import Kind, Target, checkpoint_of
 from msk_ray.experiment.attempts import FIRST
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.experiment.trial import by_environment
@@ -69,7 +69,7 @@ def test_the_terminal_names_the_best_trial_of_each(bodies: Experiment, capsys: p
 
 def test_an_experiment_over_several_has_no_best_policy(bodies: Experiment) -> None:
     with pytest.raises(CheckpointError, match="a best trial for each environment") as refused:
-        best_checkpoint(Target(Kind.EXPERIMENT, bodies.path))
+        checkpoint_of(Target(Kind.EXPERIMENT, bodies.path))
     assert all(identity in str(refused.value) for identity in best_ids(bodies).values())
 
 

@@ -44,8 +44,8 @@ from msk_ray.tune.__main__ import main as tune
 
 CONFIG, BEST = "config.yaml", "checkpoints/best.pt"
 OF_A_TRIAL = (
-    *(layout.METRICS_FILE, layout.OUTCOME_FILE, layout.HALVED_FILE, layout.DEVICE_FILE, layout.EVAL_FILE, CONFIG, BEST),
-    *(layout.ERROR_FILE, layout.OUTPUT_FILE),
+    *(layout.METRICS_FILE, layout.OUTCOME_FILE, layout.ATTEMPT_FILE, layout.DEVICE_FILE, layout.EVAL_FILE),
+    *(CONFIG, BEST, layout.ERROR_FILE, layout.OUTPUT_FILE),
 )
 OF_THE_EXPERIMENT = (
     *(layout.MANIFEST_FILE, layout.SPACE_FILE, layout.ENVIRONMENT_FILE, layout.NOTES_FILE, layout.SUMMARY_FILE),

@@ -18,8 +18,8 @@ from msk_ray.legs.config import LegReward
 from msk_ray.legs.metabolic import Fibres, muscle_masses, power
 from msk_ray.legs.myoleg26.config import MyoLeg26Settings
 from msk_ray.legs.myoleg26.env import MyoLeg26
-from msk_ray.legs.push import pushes
 from msk_ray.legs.reference import people_angles, sway
+from msk_ray.legs.regular_pushes import pushes
 from msk_ray.legs.terms import toes, track, track_rate
 from msk_ray.step import StepState
 

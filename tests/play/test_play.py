@@ -24,7 +24,7 @@ from msk_ray.envs import Env, make_env
 from msk_ray.errors import ConfigError, DeviceError
 from msk_ray.experiment.manifest import Experiment
 from msk_ray.play.agents import random_policy, zero_policy
-from msk_ray.play.episodes import play_episodes
+from msk_ray.play.live import play_episodes
 from msk_ray.play.screen import Screen
 from msk_ray.step import StepState
 

@@ -12,7 +12,7 @@ from msk_ray.report.charts import Plot
 from msk_ray.report.curves import learning_curves
 from msk_ray.report.page import places_of
 from msk_ray.report.reading import read_experiment
-from msk_ray.report.tables import baseline_of, by_variant_and_environment, variant_rows
+from msk_ray.report.tables import baseline_of, by_variant_and_environment, compare_variants
 
 pytestmark = pytest.mark.long
 
@@ -23,7 +23,7 @@ def test_each_environment_is_a_part_of_the_page(tmp_path: Path) -> None:
     parts = reading.parts()
     assert [(part.name, len(part.trials)) for part in parts] == [("bodies: hopper", 4), ("bodies: cheetah", 4)]
     assert parts[0].parts() == [parts[0]]
-    rows = variant_rows(parts[0], baseline_of(parts[0], None))
+    rows = compare_variants(parts[0], baseline_of(parts[0], None))
     # Scores 8 and 12, and 4 and 6.
     assert [(row.variant, row.mean, row.worst, row.env_steps, row.seconds, row.difference) for row in rows] == [
         ("fast", 10.0, 8.0, 400.0, 12.0, 5.0),

@@ -28,7 +28,7 @@ from msk_ray.report.curves import curve_over, learning_curves, rung_steps
 from msk_ray.report.effects import ranked_effects
 from msk_ray.report.page import _templates, make_section, places_of
 from msk_ray.report.reading import Condition, read_again, read_experiment
-from msk_ray.report.tables import failures, outcome_figures, variant_rows
+from msk_ray.report.tables import compare_variants, failures, outcome_figures
 from msk_ray.sweep import opening
 from msk_ray.sweep.space import parse_space
 from msk_ray.sweep.trials import base_settings, make_trial, resolve_trials
@@ -85,7 +85,7 @@ def test_tables_by_hand(experiment: Experiment) -> None:
     reading = read_experiment(experiment, time.time())
     assert reading.condition is Condition.FINISHED
     assert reading.warnings == ()
-    rows = variant_rows(reading, "baseline")
+    rows = compare_variants(reading, "baseline")
     assert [(r.variant, r.mean, r.difference, r.verdict) for r in rows] == [
         ("fast", 32.0, 21.0, "better"),
         ("baseline", 11.0, None, "baseline"),
@@ -109,7 +109,7 @@ def test_stopped_trials_are_compared_where_they_stopped(experiment: Experiment) 
         elif trial.changed["variant"] == "fast":
             fill(experiment.trial_folder(trial.id), [0.0, 7.0 + trial.seed], Ending(Outcome.STOPPED_ASHA, "behind"))
     reading = read_experiment(experiment, time.time())
-    rows = {row.variant: row for row in variant_rows(reading, "baseline")}
+    rows = {row.variant: row for row in compare_variants(reading, "baseline")}
     fast, deep = rows["fast"], rows["deep"]
     assert (fast.mean, fast.cut, rows["baseline"].mean) == (7.5, 2, 60.0)
     # At 200 env steps: (7 + 8)/2 against (4 + 6)/2; the bootstrap's extremes are 7 - 6 and 8 - 4.
@@ -133,7 +133,7 @@ def compared(made: Experiment, curves: dict[str, list[tuple[int, float]]], outco
         (made.trial_folder(trial.id) / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
         if name == "fast":
             write_ending(made.trial_folder(trial.id), Ending(outcome, "so"))
-    rows_now = variant_rows(read_experiment(made, time.time()), "baseline")
+    rows_now = compare_variants(read_experiment(made, time.time()), "baseline")
     return next(r for r in rows_now if r.variant == "fast")
 
 
@@ -157,7 +157,7 @@ def test_nothing_is_told_from_untrained_policies(experiment: Experiment) -> None
     effects = {effect.factor: effect for effect in ranked_effects(reading, places_of([reading]))}
     variant = effects["variant"]
     assert (variant.share, variant.spread, variant.too_few) == (None, None, "fast has none, and 1 more")
-    rows = {row.variant: row for row in variant_rows(reading, "baseline")}
+    rows = {row.variant: row for row in compare_variants(reading, "baseline")}
     assert [(rows[v].mean, rows[v].difference, rows[v].verdict) for v in ("fast", "deep")] == [
         (None, None, "no score")
     ] * 2

@@ -8,8 +8,8 @@ import torch
 
 from msk_ray.config import Config, parse_config
 from msk_ray.training import evaluation, recorded_evaluation
-from msk_ray.training.episodes import Episodes
 from msk_ray.training.evaluation import Evaluator
+from msk_ray.training.evaluation_tally import Episodes
 
 
 class Again:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.algorithms.base import Algorithm, Clock, EpochResult, simulation_metrics
-from msk_ray.algorithms.episodes import EpisodeTracker
+from msk_ray.algorithms.episode_tracker import EpisodeTracker
 from msk_ray.algorithms.nonfinite import nonfinite_observation, nonfinite_reward
 from msk_ray.config import Config, NetworkConfig, PpoConfig
 from msk_ray.envs import Env

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from msk_ray.algorithms.base import Algorithm, EpochResult, simulation_metrics
-from msk_ray.algorithms.episodes import EpisodeTracker
+from msk_ray.algorithms.episode_tracker import EpisodeTracker
 from msk_ray.algorithms.nonfinite import nonfinite_observation, nonfinite_reward
 from msk_ray.algorithms.shac.actor_update import MAX_NONFINITE_SHARE, ActorOutcome, ActorUpdate, EpochInputs
 from msk_ray.algorithms.shac.critic_fit import CriticFit

@@ -11,7 +11,7 @@ from msk_ray.cli import Parser, positive, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import ConfigError, brief
 from msk_ray.evaluate.stored import eval_file_of, store_evaluation
-from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
+from msk_ray.evaluate.targets import checkpoint_of, find_target, trial_folder_of
 from msk_ray.files import make_folder, write_json
 from msk_ray.shipped import is_shipped
 from msk_ray.text_table import text_table
@@ -64,7 +64,7 @@ def parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
-    paths = [best_checkpoint(find_target(target, args.storage)) for target in args.targets]
+    paths = [checkpoint_of(find_target(target, args.storage)) for target in args.targets]
     shipped = next(filter(is_shipped, paths), None)
     if shipped is not None and args.out is None:
         raise ConfigError(f"{shipped} belongs to the package, which nothing is written into: add --out DIR")

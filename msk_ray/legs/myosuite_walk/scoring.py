@@ -21,7 +21,7 @@ from msk_ray.legs.myosuite_walk.declaration import MYOSUITE
 from msk_ray.legs.myosuite_walk.mirror import WalkMirror
 from msk_ray.legs.myosuite_walk.model import build_myosuite_walk
 from msk_ray.training import SavedPolicy
-from msk_ray.training.episodes import Episodes
+from msk_ray.training.evaluation_tally import Episodes
 from msk_ray.training.threads import use_threads
 
 ENVIRONMENT: Final = "myoLegWalk-v0"

@@ -27,7 +27,7 @@ from msk_ray.robots.tracking.config import G1TrackingSettings
 from msk_ray.robots.tracking.env import G1Tracking
 from msk_ray.robots.tracking.motions import Clip, read_motions
 from msk_ray.training import SavedPolicy
-from msk_ray.training.episodes import Episodes
+from msk_ray.training.evaluation_tally import Episodes
 from msk_ray.training.threads import use_threads
 
 Observations = NDArray[np.float32]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from msk_ray.cli import STORAGE, Parser, run
 from msk_ray.compiling import announce_compiling
 from msk_ray.errors import ConfigError
-from msk_ray.evaluate.targets import best_checkpoint, find_target, trial_folder_of
+from msk_ray.evaluate.targets import checkpoint_of, find_target, trial_folder_of
 from msk_ray.files import make_folder, write_json
 from msk_ray.progress import Pace
 from msk_ray.shipped import is_shipped
@@ -48,7 +48,7 @@ def parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = parser().parse_args(argv)
-    path = best_checkpoint(find_target(args.target, args.storage))
+    path = checkpoint_of(find_target(args.target, args.storage))
     if args.out is None and is_shipped(path):
         raise ConfigError(f"{path} belongs to the package, which nothing is written into: add --out DIR")
     announce_compiling(f"following clips with {path}")

@@ -1,4 +1,4 @@
-"""What named parts of a model touch, and for how long.
+"""What named parts of a model touched in the substeps of an env step, and for how long; without gradient.
 
 Axes: S substeps, W worlds, n named parts.
 """

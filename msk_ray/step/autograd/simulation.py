@@ -14,7 +14,7 @@ from msk_ray.step.autograd.contact_state import Contact
 from msk_ray.step.autograd.flags import known_none
 from msk_ray.step.autograd.jacobian import Linearization
 from msk_ray.step.autograd.modes import make_backward
-from msk_ray.step.autograd.parameters import check_values
+from msk_ray.step.autograd.parameter_tensors import check_values
 from msk_ray.step.autograd.step_parameters import Bundles, StepParameters
 from msk_ray.step.autograd.stepper import Engine, Stepper
 from msk_ray.step.autograd.tangent import Tangent

@@ -1,4 +1,6 @@
-"""Model parameters as autograd inputs, bundled so that a step's gradient for all of them is one tensor.
+"""Parameters as inputs of autograd, bundled so that a step's gradient for all of them is one tensor.
+
+`parameter_tensors` writes their values.
 
 A rollout takes many steps with the same values. If each value were an input of each step, autograd would sum their
 gradients one by one: for the ant's 30 parameters, that would be as many small kernels per step as the whole pullback.

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from msk_ray.step.autograd.backward import Backward, ExternalForces, StepState
 from msk_ray.step.autograd.buffers import BatchTensors, device_of, stream_of, wait_for
-from msk_ray.step.autograd.parameters import ParameterTensors
+from msk_ray.step.autograd.parameter_tensors import ParameterTensors
 from msk_ray.step.errors import ConfigError
 from msk_ray.step.forward import Graph, WorldBatch, compile_kernels, joined_stream
 from msk_ray.step.forward.capacity import Capacity

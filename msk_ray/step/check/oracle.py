@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from msk_ray.step.check.parameters import ParameterField
+from msk_ray.step.check.parameter_field import ParameterField
 from msk_ray.step.errors import SimulationError
 
 Array = NDArray[np.float64]

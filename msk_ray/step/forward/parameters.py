@@ -1,4 +1,4 @@
-"""Model fields whose values can be arguments of a step: one value for all worlds, or one per world.
+"""The list of parameters: fields of the model whose values can be arguments of a step, for all worlds or one per world.
 
 mujoco_warp reads such a field as `[worldid % shape[0]]`, so an array with a row per world is valid, if it exists before
 launches are recorded. Fields have their names in MjModel.

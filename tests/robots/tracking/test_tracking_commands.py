@@ -90,7 +90,7 @@ def test_track_writes_a_row_for_each_clip(
     config = parse_config({"env": {"name": "g1_tracking", "layout": "no_state_estimation"}})
     checkpoint = tmp_path / "best.pt"
     checkpoint.write_bytes(b"")
-    monkeypatch.setattr(track, "best_checkpoint", lambda target: checkpoint)
+    monkeypatch.setattr(track, "checkpoint_of", lambda target: checkpoint)
     monkeypatch.setattr(track, "find_target", lambda target, storage: None)
     monkeypatch.setattr("msk_ray.training.load_policy", lambda path: Still(config))
     score = ClipScore("a", 10.0, True, 0.4, 0.3, 0.35, 0.02, 0.01)

@@ -37,8 +37,8 @@ class Cone:
 
 
 @wp.func
-def cone_law(jar: vec6, mass: vec6, friction: vec5, mu: float, dim: int) -> Cone:
-    """Force of an elliptic contact; `mass` is D of its rows."""
+def cone_at(jar: vec6, mass: vec6, friction: vec5, mu: float, dim: int) -> Cone:
+    """The law of an elliptic contact at `jar`; `mass` is D of its rows."""
     out = Cone()
     out.mu = mu
     normal = mu * jar[0]

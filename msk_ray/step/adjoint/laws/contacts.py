@@ -20,7 +20,7 @@ from msk_ray.step.adjoint.groups import (
     Substep,
     allocate,
 )
-from msk_ray.step.adjoint.laws.cones import cone_law, cone_slope, vec6
+from msk_ray.step.adjoint.laws.cones import cone_at, cone_slope, vec6
 from msk_ray.step.adjoint.laws.contact_geometry.contact_order import contacts_end
 from msk_ray.step.adjoint.laws.contact_geometry.convex import pull_convex
 from msk_ray.step.adjoint.laws.contact_geometry.primitive_laws import CONVEX_PAIRS
@@ -147,7 +147,7 @@ def pull_contacts(
             for i in range(dim):
                 jar[i] = laws_in.jar[worldid, first + i]
                 mass[i] = rows_in.D[worldid, first + i]
-        cone = cone_law(jar, mass, friction, mu, dim)
+        cone = cone_at(jar, mass, friction, mu, dim)
         if elliptic:
             active = cone.zone != SATISFIED
         else:

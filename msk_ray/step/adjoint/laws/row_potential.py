@@ -1,5 +1,7 @@
 """The work of one uncoupled constraint row, which Warp differentiates by its rates, solver parameters, bound and h.
 
+`scalar_rows` calls it in its kernel; here is the formula only.
+
 -Φ ∋ ρ(λ) f(jar) ,  jar = ρ(a) + b ρ(v) + k imp pos ,  f = -D jar, or ± the friction loss where it is held at that
 """
 

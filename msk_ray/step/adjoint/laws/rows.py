@@ -1,4 +1,4 @@
-"""Constraint rows at the known acceleration: their laws f(J a - aref).
+"""The laws f(J a - aref) of all constraint rows at the known acceleration, whatever each row constrains.
 
 Row laws (design of MuJoCo's solver): limits, frictionless and pyramidal rows f = -D·jar where jar < 0; equality
 f = -D·jar; friction loss the same, clamped. Elliptic contacts couple their rows (`cones`) and are finished in

@@ -1,4 +1,4 @@
-"""Constraint rows of joints and tendons: limits, friction loss, and joint and tendon equalities."""
+"""The pullback of rows that constrain a joint or a tendon: limits, friction loss, and joint and tendon equalities."""
 
 import math
 

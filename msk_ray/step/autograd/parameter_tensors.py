@@ -1,4 +1,6 @@
-"""Model parameters as tensors: checks of their shapes, and writing them, with derived fields, into a batch's model.
+"""Values of parameters on their way into the arrays of a batch: their shapes are checked, derived fields computed.
+
+`step_parameters` leads gradients back to them; `forward.parameters` lists what can be a parameter.
 
 Axes: W worlds, B bodies, G geoms.
 """

@@ -1,4 +1,4 @@
-"""Perturbs fields of an MjModel element by element."""
+"""A parameter of C MuJoCo's model, displaced element by element for finite differences."""
 
 import copy
 from collections.abc import Iterator

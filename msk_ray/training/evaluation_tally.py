@@ -1,4 +1,4 @@
-"""The first episode of each world: what an evaluation adds up of it.
+"""The first episode of each world: what an evaluation adds up of it. (In training, `EpisodeTracker` does so.)
 
 Axes: W worlds, T reward terms.
 """

@@ -2,7 +2,7 @@
 
 import torch
 
-from msk_ray.algorithms.episodes import EpisodeTracker
+from msk_ray.algorithms.episode_tracker import EpisodeTracker
 
 
 def test_episodes_are_summed_across_rollouts() -> None:

@@ -1,4 +1,4 @@
-"""Returns and lengths of complete training episodes, which span many rollouts."""
+"""Returns and lengths of complete episodes in training, which span many rollouts. (Evaluations have a `Tally`.)"""
 
 from itertools import accumulate
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from msk_ray.errors import Failure, SimulationError
-from msk_ray.training.out_of_memory import named_out_of_memory
+from msk_ray.training.named_out_of_memory import named_out_of_memory
 
 
 @pytest.mark.parametrize(

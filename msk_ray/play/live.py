@@ -1,4 +1,4 @@
-"""Episodes in real time, one after the other."""
+"""A policy played live: episodes in real time, one after the other, on a screen."""
 
 import time
 from collections.abc import Iterator

@@ -1,4 +1,9 @@
-"""Pushes of the pelvis. Axes: W worlds."""
+"""Pushes of the pelvis at fixed intervals, by `env.push`: off by default, and the condition `push` of evaluations.
+
+Nothing is drawn; the pushes of `envs.pushes` are drawn at random, by `physics.randomize`, in training.
+
+Axes: W worlds.
+"""
 
 import math
 
