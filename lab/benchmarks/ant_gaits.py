@@ -17,7 +17,7 @@ from msk_ray.cli import run
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.training import load_policy
-from msk_ray.visualize.episodes import record
+from msk_ray.visualize.recording import record
 from msk_ray.visualize.render import States
 
 SETTLED = 2.5

@@ -135,9 +135,9 @@ def _evaluate(path: Path, device: str | None) -> None:
 def _draw(path: Path, out: Path, sha: str, device: str | None) -> None:
     from msk_ray.evaluate.measure import Bench, Request, default_device
     from msk_ray.training import load_policy
-    from msk_ray.visualize.episodes import record
     from msk_ray.visualize.film import strip
     from msk_ray.visualize.look import describe_groups, geom_groups
+    from msk_ray.visualize.recording import record
     from msk_ray.visualize.render import View, headless_backend
     from msk_ray.visualize.strips import episode_frames
 

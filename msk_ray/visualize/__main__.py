@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from msk_ray.evaluate.measure import Bench, Request
-    from msk_ray.visualize.episodes import Recording
+    from msk_ray.visualize.recording import Recording
     from msk_ray.visualize.render import View
 
 DESCRIPTION = """\
@@ -124,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.progression is not None:
         return _progression(args, target, bench, Request(args.physics, 1, seeds, args.steps))
     policy = load_policy(checkpoint_of(target))
-    from msk_ray.visualize.episodes import record
+    from msk_ray.visualize.recording import record
     from msk_ray.visualize.render import check_camera
 
     count = args.episodes or (10 if args.no_render else 1)

@@ -9,8 +9,8 @@ from msk_ray.evaluate.measure import Bench, Request
 from msk_ray.experiment.layout import best_checkpoint_in
 from msk_ray.training import load_policy
 from msk_ray.training.checkpoint import milestones
-from msk_ray.visualize.episodes import Recording, record
 from msk_ray.visualize.film import grid
+from msk_ray.visualize.recording import Recording, record
 from msk_ray.visualize.render import View, frames
 
 

@@ -17,7 +17,7 @@ from msk_ray.legs.gait.measure import contacts
 from msk_ray.legs.gait.stick import one_stride
 from msk_ray.shipped import shipped_folder
 from msk_ray.training import SavedPolicy, load_policy
-from msk_ray.visualize.episodes import Recording, record
+from msk_ray.visualize.recording import Recording, record
 
 SUBSTEPS = 5
 """Of myoleg26: 4 ms of 20 ms."""

@@ -38,7 +38,9 @@ def make(
 ) -> VelocityEnv[Any]:
     name = f"{robot}_velocity"
     settings = settings_class(name)(name=name, **changes)
-    env = make_env(settings, physics or PhysicsConfig(), nworld, "cpu", 0, differentiable=differentiable, randomize=True)
+    env = make_env(
+        settings, physics or PhysicsConfig(), nworld, "cpu", 0, differentiable=differentiable, randomize=True
+    )
     assert isinstance(env, VelocityEnv)
     return env
 

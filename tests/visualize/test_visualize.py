@@ -24,9 +24,9 @@ from msk_ray.report.__main__ import main as report
 from msk_ray.training import load_policy
 from msk_ray.visualize import render
 from msk_ray.visualize.__main__ import main
-from msk_ray.visualize.episodes import record
 from msk_ray.visualize.film import write_video
 from msk_ray.visualize.look import ACTIVE, RELAXED, Look, describe_groups, geom_groups, muscle_tendons
+from msk_ray.visualize.recording import record
 from msk_ray.visualize.render import States, View, frames, headless_backend
 
 pytestmark = pytest.mark.long

@@ -13,7 +13,7 @@ from msk_ray.legs.gait.body import Array, Episode, Motion, analyse, between, che
 from msk_ray.legs.gait.measure import measure
 from msk_ray.training import SavedPolicy
 from msk_ray.training.threads import use_threads
-from msk_ray.visualize.episodes import Recording, record
+from msk_ray.visualize.recording import Recording, record
 
 _KEPT = ("gait_distance", "gait_distance_parts", "people", "at_speed", "measures", "timing", "costs", "strides")
 """Parts of a gait that `eval.json` has; curves are in `gait.json`."""
