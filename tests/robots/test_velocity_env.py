@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,14 +34,13 @@ def make(
     robot: str = "go1",
     *,
     differentiable: bool = False,
-    physics: PhysicsConfig | None = None,
+    randomize: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> VelocityEnv[Any]:
     name = f"{robot}_velocity"
     settings = settings_class(name)(name=name, **changes)
-    env = make_env(
-        settings, physics or PhysicsConfig(), nworld, "cpu", 0, differentiable=differentiable, randomize=True
-    )
+    physics = PhysicsConfig(randomize=randomize)
+    env = make_env(settings, physics, nworld, "cpu", 0, differentiable=differentiable, randomize=True)
     assert isinstance(env, VelocityEnv)
     return env
 
@@ -127,8 +127,7 @@ def test_a_pose_tail_gives_pose_terms_a_slope_in_training_but_not_in_scores() ->
 
 def test_late_observations_show_the_last_action_and_the_command_of_now() -> None:
     """The policy does not measure what it did and what it is asked to do."""
-    late = PhysicsConfig(randomize={"observation_delay": [1, 1]})
-    env = make(2, physics=late)
+    env = make(2, randomize={"observation_delay": [1, 1]})
     env.step(torch.full((2, env.action_size), 0.25))
     before = env.observe(env.state.physics, env.state.action)
     env.step(torch.full((2, env.action_size), 0.5))
