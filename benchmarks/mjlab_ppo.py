@@ -2,12 +2,14 @@
 
     PYTHON_OF_MJLAB benchmarks/mjlab_ppo.py train Mjlab-Velocity-Flat-Unitree-Go1 --minutes 1 2 3 5 --to ppo
     PYTHON_OF_MJLAB benchmarks/mjlab_ppo.py score ppo
+    PYTHON_OF_MJLAB benchmarks/mjlab_ppo.py train Mjlab-Tracking-Flat-Unitree-G1 --motion dance.npz --to ppo_dance
 
 It runs in a Python that has mjlab, which needs another MuJoCo than this package, and imports none of the package but
 one file. `train` writes the policy to the folder at each of the times, which count from the start of this process to
 the end of the iteration in which the time is up. `score`, on this or another machine, plays them as `msk-ray evaluate
 --in mjlab` does: deterministic, the first episode of each world, with mjlab's settings for playing and then with
-training's pushes and noise. It prints a line for each and writes all to scores.json in the folder.
+training's pushes and noise. It prints a line for each and writes all to scores.json in the folder. `msk-ray motions
+CLIP.csv --npz FOLDER` writes the clips that tracking tasks follow.
 """
 
 import time
@@ -47,15 +49,17 @@ def main() -> None:
     p.add_argument("--device", default="cuda:0")
     commands = p.add_subparsers(required=True)
     t = commands.add_parser("train", help="train, keeping policies")
-    t.add_argument("task", help="name of a velocity task of mjlab")
+    t.add_argument("task", help="name of a velocity or tracking task of mjlab")
     t.add_argument("--minutes", type=float, nargs="+", default=[1.0, 2.0, 3.0, 5.0], help="when policies are kept")
     t.add_argument("--worlds", type=int, default=4096, help="mjlab's examples train with 4096")
     t.add_argument("--seed", type=int, default=0)
+    t.add_argument("--motion", help="clip that a tracking task follows, .npz")
     t.add_argument("--to", type=Path, required=True, help="folder for the policies, not yet there")
     t.set_defaults(run=train)
     s = commands.add_parser("score", help="score the policies in a folder")
     s.add_argument("folder", type=Path)
     s.add_argument("--episodes", type=int, default=256, help="of 1000 steps")
+    s.add_argument("--motion", help="clip that the policies of a tracking task follow, .npz")
     s.set_defaults(run=score)
     args = p.parse_args()
     args.run(args)
@@ -65,9 +69,13 @@ def train(args: argparse.Namespace) -> None:
     """Train until the last of the times. A line is printed every 25 iterations and for each policy that is kept."""
     if args.to.exists():
         raise SystemExit(f"{args.to} exists: write another folder in --to")
-    args.to.mkdir(parents=True)
     cfg = load_env_cfg(args.task)
     cfg.scene.num_envs, cfg.seed = args.worlds, args.seed
+    if ("motion" in cfg.commands) != (args.motion is not None):
+        raise SystemExit(f"--motion: {args.task} follows " + ("a clip: write one" if args.motion is None else "none"))
+    if args.motion is not None:
+        cfg.commands["motion"].motion_file = args.motion
+    args.to.mkdir(parents=True)
     torch.manual_seed(args.seed)
     env, runner = runner_in(ManagerBasedRlEnv(cfg, args.device), args.task, args.seed, args.device)
     waiting = sorted(60.0 * minutes for minutes in args.minutes)
@@ -115,7 +123,7 @@ def score(args: argparse.Namespace) -> None:
     result = {"versions": versions, "scored_on": device_name(args.device), "episodes": args.episodes, "scores": []}
     to = args.folder / "scores.json"
     for pushed in (False, True):
-        unwrapped, errors = mjlab_side.task_for_scoring(task, pushed, args.episodes, 0, args.device)
+        unwrapped, errors = mjlab_side.task_for_scoring(task, pushed, args.episodes, 0, args.device, args.motion)
         env, runner = runner_in(unwrapped, task, 0, args.device)
         policy = runner.alg.get_policy().eval()
         for saved in kept:
