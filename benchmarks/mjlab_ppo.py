@@ -21,6 +21,7 @@ import contextlib  # noqa: E402
 import importlib.metadata  # noqa: E402
 import json  # noqa: E402
 import os  # noqa: E402
+import shutil  # noqa: E402
 import sys  # noqa: E402
 from dataclasses import asdict  # noqa: E402
 from pathlib import Path  # noqa: E402
@@ -37,6 +38,8 @@ import mjlab_side  # type: ignore[import-not-found]  # noqa: E402
 
 STEPS = 1000
 """Of an episode, 20 s."""
+MOTION = "motion.npz"
+"""Copy of the clip beside the policies of a tracking task."""
 
 
 class TimeIsUp(Exception):
@@ -53,13 +56,12 @@ def main() -> None:
     t.add_argument("--minutes", type=float, nargs="+", default=[1.0, 2.0, 3.0, 5.0], help="when policies are kept")
     t.add_argument("--worlds", type=int, default=4096, help="mjlab's examples train with 4096")
     t.add_argument("--seed", type=int, default=0)
-    t.add_argument("--motion", help="clip that a tracking task follows, .npz")
+    t.add_argument("--motion", type=Path, help="clip that a tracking task follows, .npz")
     t.add_argument("--to", type=Path, required=True, help="folder for the policies, not yet there")
     t.set_defaults(run=train)
     s = commands.add_parser("score", help="score the policies in a folder")
     s.add_argument("folder", type=Path)
     s.add_argument("--episodes", type=int, default=256, help="of 1000 steps")
-    s.add_argument("--motion", help="clip that the policies of a tracking task follow, .npz")
     s.set_defaults(run=score)
     args = p.parse_args()
     args.run(args)
@@ -73,9 +75,11 @@ def train(args: argparse.Namespace) -> None:
     cfg.scene.num_envs, cfg.seed = args.worlds, args.seed
     if ("motion" in cfg.commands) != (args.motion is not None):
         raise SystemExit(f"--motion: {args.task} follows " + ("a clip: write one" if args.motion is None else "none"))
-    if args.motion is not None:
-        cfg.commands["motion"].motion_file = args.motion
+    if args.motion is not None and not args.motion.is_file():
+        raise SystemExit(f"--motion: there is no {args.motion}; msk-ray motions CLIP.csv --npz FOLDER writes one")
     args.to.mkdir(parents=True)
+    if args.motion is not None:
+        cfg.commands["motion"].motion_file = shutil.copyfile(args.motion, str(args.to / MOTION))
     torch.manual_seed(args.seed)
     env, runner = runner_in(ManagerBasedRlEnv(cfg, args.device), args.task, args.seed, args.device)
     waiting = sorted(60.0 * minutes for minutes in args.minutes)
@@ -118,12 +122,14 @@ def score(args: argparse.Namespace) -> None:
     if not files:
         raise SystemExit(f"{args.folder} holds no policies (*.pt); make some with: train TASK --to {args.folder}")
     kept = [torch.load(file, map_location=args.device, weights_only=True) for file in files]
-    task = kept[0]["facts"]["task"]
+    task, motion = kept[0]["facts"]["task"], args.folder / MOTION
     versions = {name: importlib.metadata.version(name) for name in (*mjlab_side.PACKAGES, "rsl-rl-lib")}
     result = {"versions": versions, "scored_on": device_name(args.device), "episodes": args.episodes, "scores": []}
     to = args.folder / "scores.json"
     for pushed in (False, True):
-        unwrapped, errors = mjlab_side.task_for_scoring(task, pushed, args.episodes, 0, args.device, args.motion)
+        unwrapped, errors = mjlab_side.task_for_scoring(
+            task, pushed, args.episodes, 0, args.device, str(motion) if motion.exists() else None
+        )
         env, runner = runner_in(unwrapped, task, 0, args.device)
         policy = runner.alg.get_policy().eval()
         for saved in kept:

@@ -8,7 +8,7 @@ Axes: W worlds.
 from collections import deque
 from collections.abc import Callable, Hashable
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +21,8 @@ from msk_ray.step.autograd.kinematics import Frames, Kinematics, Names, as_named
 from msk_ray.step.autograd.sensors import Readings, Sensors
 from msk_ray.step.autograd.tendon_lengths import Tendons
 from msk_ray.step.forward.contact_watch import FIGURES
+
+Quantity = TypeVar("Quantity")
 
 
 class Measurements:
@@ -62,7 +64,7 @@ class Measurements:
         self._step = None
         self._measured = {}
 
-    def once(self, what: Hashable, state: object, measure: Callable[[], Any]) -> Any:
+    def once(self, what: Hashable, state: object, measure: Callable[[], Quantity]) -> Quantity:
         """The result of `measure` for `state`, of the physics or of the worlds, kept under the key `what`.
 
         Two are kept, because a step goes back and forth between the state that it starts from and the one it reaches.
@@ -71,20 +73,19 @@ class Measurements:
         kept = self._measured.setdefault(what, deque(maxlen=2))
         for measured, with_grad, result in kept:
             if measured is state and with_grad == grad:
-                return result
-        result = measure()
-        kept.append((state, grad, result))
-        return result
+                found: Quantity = result
+                return found
+        new = measure()
+        kept.append((state, grad, new))
+        return new
 
     def frames(self, state: StepState) -> Frames:
         """As `Env.frames`."""
-        frames: Frames = self.once("frames", state, lambda: self._kinematics(state.qpos, state.qvel))
-        return frames
+        return self.once("frames", state, lambda: self._kinematics(state.qpos, state.qvel))
 
     def tendons(self, state: StepState) -> tuple[Tensor, Tensor]:
         """As `Env.tendons`."""
-        tendons: tuple[Tensor, Tensor] = self.once("tendons", state, lambda: self._tendons(state.qpos, state.qvel))
-        return tendons
+        return self.once("tendons", state, lambda: self._tendons(state.qpos, state.qvel))
 
     def contact_forces(self, state: StepState, geom: Names) -> Tensor:
         """As `Env.contact_forces`."""
@@ -103,18 +104,16 @@ class Measurements:
             shape = (self._sim.substeps, self._sim.nworld, len(query.primary), FIGURES)
             return Contact.of(torch.zeros(shape, device=self._sim.device))
         diverged = self._diverged_in_step_to(state, "contacts")
-        contact: Contact = self.once(query, state, lambda: self._sim.contacts(query))
-        return contact.without(diverged)
+        return self.once(query, state, lambda: self._sim.contacts(query)).without(diverged)
 
     def sensors(self, state: StepState) -> Readings:
         """As `Env.sensors`."""
         frames, tendons = lambda: self.frames(state), lambda: self.tendons(state)
-        readings: Readings = self.once(
+        return self.once(
             "sensors",
             state,
             lambda: Readings(self._sensors, state.qpos, state.qvel, frames, tendons, lambda: self._sensordata(state)),
         )
-        return readings
 
     @cached_property
     def ground(self) -> Ground:

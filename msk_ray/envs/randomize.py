@@ -258,7 +258,8 @@ def _chosen(model: mujoco.MjModel, name: str, draw: AnyDraw) -> list[int]:
         base = attrgetter(field.arrays[0])(model)
         rows = [row for row, owner in enumerate(_owners(model, name, range(len(base)))) if owner in wanted]
         if name in _SERVO_COLUMNS:
-            rows = [row for row in rows if position_servos(model)[row]]
+            servos = position_servos(model)
+            rows = [row for row in rows if servos[row]]
         if not rows:
             raise ConfigError(f"{key}: the model has no {field.element} whose value could be drawn; leave it out")
     _refuse_without_effect(model, name, draw, rows)

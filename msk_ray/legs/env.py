@@ -135,8 +135,7 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
 
     def root(self, state: StepState) -> Root:
         """The pelvis in the world, computed once per state."""
-        found: Root = self.measurements.once("root", state, lambda: self.measure_root(state))
-        return found
+        return self.measurements.once("root", state, lambda: self.measure_root(state))
 
     @abstractmethod
     def people_poses(self) -> NDArray[np.float64]:
@@ -266,13 +265,11 @@ class LegEnv(AssistedEnv[AnyLegSettings], Generic[AnyLegSettings]):
 
     def speed(self, state: StepState) -> Tensor:
         """Forward speed [m/s], (W,)."""
-        speed: Tensor = self.measurements.once("speed", state, lambda: self.root(state).velocity.unbind(-1)[0])
-        return speed
+        return self.measurements.once("speed", state, lambda: self.root(state).velocity.unbind(-1)[0])
 
     def flexion_rates(self, state: StepState) -> Tensor:
         """Rates of the right and the left hip's flexion [rad/s], (W, 2)."""
-        rates: Tensor = self.measurements.once("flexion_rates", state, lambda: state.qvel[:, self._flexion_dofs])
-        return rates
+        return self.measurements.once("flexion_rates", state, lambda: state.qvel[:, self._flexion_dofs])
 
     def metabolic_power(self, state: StepState, action: Tensor) -> Tensor:
         """Metabolic power of all muscles [W], (W,), without that of rest, after actions (W, A)."""

@@ -159,8 +159,7 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     def velocity_command(self) -> Tensor:
         """Commanded velocity forward and to the left [m/s], and yaw rate [rad/s], in the current state, (W, 3)."""
-        command: Tensor = self.measurements.once("velocity_command", self.state, self._velocity_command)
-        return command
+        return self.measurements.once("velocity_command", self.state, self._velocity_command)
 
     def _velocity_command(self) -> Tensor:
         forward, left, turn, heading, *draws = self.command("velocity").unbind(-1)
@@ -189,10 +188,7 @@ class VelocityEnv(ServoEnv[AnyVelocitySettings], Generic[AnyVelocitySettings]):
 
     def base_velocities(self, state: StepState) -> tuple[Tensor, Tensor]:
         """Velocity [m/s] and angular velocity [rad/s] of the base in its own axes, each (W, 3)."""
-        velocities: tuple[Tensor, Tensor] = self.measurements.once(
-            "base_velocities", state, lambda: self._base_velocities(state)
-        )
-        return velocities
+        return self.measurements.once("base_velocities", state, lambda: self._base_velocities(state))
 
     def _base_velocities(self, state: StepState) -> tuple[Tensor, Tensor]:
         frames, base = self.frames(state), self.robot.base

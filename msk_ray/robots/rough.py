@@ -97,10 +97,9 @@ class Go1VelocityRough(VelocityEnv[Go1VelocityRoughSettings]):
 
     def scan(self, state: StepState) -> Tensor:
         """Height of the trunk above the ground around it [m], (W, P)."""
-        found: Tensor = self.measurements.once(
+        return self.measurements.once(
             "scan", state, lambda: self.ground.scan(self.frames(state), self.robot.trunk, self._scanned, _REACH)
         )
-        return found
 
     def tilt_to_ground(self, state: StepState) -> Tensor:
         """(Sine of the angle between the trunk's z axis and the normal of the ground around it)², (W,)."""

@@ -215,13 +215,11 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
             # `diagnose` takes finite differences in float64.
             return Reference(*(part.to(state.qpos.dtype) for part in self.references.bodies(self.frame())))
 
-        reference: Reference = self.measurements.once("reference", state, look_up)
-        return reference
+        return self.measurements.once("reference", state, look_up)
 
     def deviation(self, state: StepState) -> Deviation:
         """Deviation of a state reached by a step from its `reference`."""
-        deviation: Deviation = self.measurements.once("deviation", state, lambda: self._deviation(state))
-        return deviation
+        return self.measurements.once("deviation", state, lambda: self._deviation(state))
 
     def _deviation(self, state: StepState) -> Deviation:
         reference, frames, anchor = self.reference(state), self.frames(state), self._anchor
@@ -292,11 +290,9 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
 
     def _observation_of(self, state: StepState, full: bool) -> Tensor:
         """The observation, with the entries that a robot cannot measure if it is `full`."""
-        if state is not self.state.physics:
+        if state is not self.state.physics:  # as in comparisons with finite differences
             return self._compute_observation(state, full)
-        key = "full observation" if full else "observation"
-        observation: Tensor = self.measurements.once(key, self.state, lambda: self._compute_observation(state, full))
-        return observation
+        return self.measurements.once(("observation", full), self.state, lambda: self._compute_observation(state, full))
 
     def _compute_observation(self, state: StepState, full: bool) -> Tensor:
         frames, sensors = self.frames(state), self.sensors(state)
