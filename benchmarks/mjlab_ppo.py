@@ -36,8 +36,6 @@ from mjlab.tasks.registry import load_env_cfg, load_rl_cfg  # noqa: E402
 sys.path.insert(0, str(Path(__file__).parents[1] / "msk_ray/robots/mjlab"))
 import mjlab_side  # type: ignore[import-not-found]  # noqa: E402
 
-STEPS = 1000
-"""Of an episode, 20 s."""
 MOTION = "motion.npz"
 """Copy of the clip beside the policies of a tracking task."""
 
@@ -61,7 +59,9 @@ def main() -> None:
     t.set_defaults(run=train)
     s = commands.add_parser("score", help="score the policies in a folder")
     s.add_argument("folder", type=Path)
-    s.add_argument("--episodes", type=int, default=256, help="of 1000 steps")
+    s.add_argument("--episodes", type=int, default=256, help="one in each world")
+    s.add_argument("--steps", type=int, default=1000, help="of an episode, 20 ms each; an episode ends earlier in a fall")
+    s.add_argument("--sampling", choices=("start", "uniform"), default="start", help="where in a clip episodes begin")
     s.set_defaults(run=score)
     args = p.parse_args()
     args.run(args)
@@ -124,18 +124,19 @@ def score(args: argparse.Namespace) -> None:
     kept = [torch.load(file, map_location=args.device, weights_only=True) for file in files]
     task, motion = kept[0]["facts"]["task"], args.folder / MOTION
     versions = {name: importlib.metadata.version(name) for name in (*mjlab_side.PACKAGES, "rsl-rl-lib")}
-    result = {"versions": versions, "scored_on": device_name(args.device), "episodes": args.episodes, "scores": []}
+    how = {"episodes": args.episodes, "steps": args.steps, "sampling": args.sampling}
+    result = {"versions": versions, "scored_on": device_name(args.device), **how, "scores": []}
     to = args.folder / "scores.json"
     for pushed in (False, True):
         unwrapped, errors = mjlab_side.task_for_scoring(
-            task, pushed, args.episodes, 0, args.device, str(motion) if motion.exists() else None
+            task, pushed, args.episodes, 0, args.device, str(motion) if motion.exists() else None, args.sampling
         )
         env, runner = runner_in(unwrapped, task, 0, args.device)
         policy = runner.alg.get_policy().eval()
         for saved in kept:
             with torch.inference_mode():  # as in training, or its statistics of observations are refused
                 policy.load_state_dict(saved["policy"])
-            row = {**saved["facts"], "pushed": pushed, **means(unwrapped, errors, policy)}
+            row = {**saved["facts"], "pushed": pushed, **means(unwrapped, errors, policy, args.steps)}
             result["scores"].append(row)
             print(json.dumps(row), flush=True)
             to.write_text(json.dumps(result, indent=1), encoding="utf-8")
@@ -148,7 +149,7 @@ def device_name(device: str) -> str:
 
 
 @torch.inference_mode()
-def means(env, errors, policy) -> dict[str, float]:  # type: ignore[no-untyped-def]
+def means(env, errors, policy, steps_of_episode: int) -> dict[str, float]:  # type: ignore[no-untyped-def]
     """Means over the first episodes of all worlds."""
     obs, _ = env.reset(seed=0)
     worlds = env.num_envs
@@ -156,7 +157,7 @@ def means(env, errors, policy) -> dict[str, float]:  # type: ignore[no-untyped-d
     an_episode = dict.fromkeys(("return", "fell"), 0.0)
     a_step: dict[str, float] = {}
     steps = 0.0
-    for _ in range(STEPS):
+    for _ in range(steps_of_episode):
         obs, reward, terminated, _, _ = env.step(policy(obs))
         ended = running & terminated
         an_episode["return"] += (reward * running).sum()
@@ -166,7 +167,10 @@ def means(env, errors, policy) -> dict[str, float]:  # type: ignore[no-untyped-d
             a_step[name] = a_step.get(name, 0.0) + (error * (running & ~ended)).sum()
         steps += running.sum()
         running &= ~ended
+        if not running.any():
+            break
     found = {name: value / worlds for name, value in an_episode.items()}
+    found["length"] = steps / worlds
     found |= {name: value / steps for name, value in a_step.items()}
     return {name: round(float(mean), 4) for name, mean in found.items()}
 

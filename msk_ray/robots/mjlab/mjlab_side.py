@@ -1,7 +1,7 @@
 """Runs episodes of an unmodified task of mjlab for `scoring`, in a Python that has mjlab.
 
 That Python has another version of MuJoCo and lacks this package, so this file imports nothing from it. It is started
-with one JSON argument {task, seed, worlds, steps, pushed, motion}. On standard output it writes a line of JSON that
+with one JSON argument {task, seed, worlds, steps, pushed, motion, sampling}. On standard output it writes a line of JSON that
 says what it runs, then the first observations of all worlds, and after each step a `record` of each world. On standard
 input it reads the actions of all worlds before each step. mjlab's own messages go to standard error.
 """
@@ -51,7 +51,7 @@ def motion_errors(env, command):  # type: ignore[no-untyped-def]
 
 
 def task_for_scoring(  # type: ignore[no-untyped-def]
-    task: str, pushed: bool, worlds: int, seed: int, device: str, motion: str | None = None
+    task: str, pushed: bool, worlds: int, seed: int, device: str, motion: str | None = None, sampling: str = "start"
 ):
     """The environment of a mjlab task, and a dictionary into which each step writes the errors (W,) by name.
 
@@ -62,6 +62,7 @@ def task_for_scoring(  # type: ignore[no-untyped-def]
         seed: seed of the environment.
         device: "cpu" or "cuda:N".
         motion: path of the clip, for a task that follows one.
+        sampling: where its episodes begin, "start" (mjlab's setting for playing) or "uniform".
     """
     from mjlab.envs import ManagerBasedRlEnv
     from mjlab.tasks.registry import load_env_cfg
@@ -71,7 +72,7 @@ def task_for_scoring(  # type: ignore[no-untyped-def]
         cfg.events["push_robot"] = load_env_cfg(task).events["push_robot"]
         cfg.observations["actor"].enable_corruption = True
     if motion is not None:
-        cfg.commands["motion"].motion_file = motion
+        cfg.commands["motion"].motion_file, cfg.commands["motion"].sampling_mode = motion, sampling
     cfg.scene.num_envs, cfg.seed = worlds, seed
     env = ManagerBasedRlEnv(cfg, device)
     command = env.command_manager.get_term(command_name(motion))
@@ -105,7 +106,9 @@ def main() -> None:
     worlds = order["worlds"]
     device = "cuda:0" if torch.cuda.is_available() else "cpu"
     motion = order["motion"]
-    env, errors = task_for_scoring(order["task"], order["pushed"], worlds, order["seed"], device, motion)
+    env, errors = task_for_scoring(
+        order["task"], order["pushed"], worlds, order["seed"], device, motion, order["sampling"]
+    )
     obs, _ = env.reset()
     terms = env.reward_manager.active_terms
     observations, actions = obs["actor"].shape[1], env.action_manager.total_action_dim

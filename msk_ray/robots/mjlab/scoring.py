@@ -142,6 +142,8 @@ class MjlabScorer:
         assert request.steps is not None
         seeds = request.seeds or (0,)
         order = {"task": task, "pushed": request.physics == PUSHED, "worlds": request.worlds, "steps": request.steps}
+        env = policy.config.env
+        order["sampling"] = env.score_sampling if isinstance(env, G1TrackingSettings) else None
         runs = []
         with motion_of(policy.config) as motion:
             for seed in seeds:
@@ -193,6 +195,8 @@ class _MjlabProcess(ForeignProcess):
                 total[counted] += step[name][counted]
             fell |= ended
             running &= ~ended
+            if not running.any():
+                break
             obs = np.ascontiguousarray(step["obs"])
         diverged = ~np.isfinite(sums["reward"])
         return Episodes(
