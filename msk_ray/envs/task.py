@@ -161,6 +161,11 @@ class Task(ABC, Generic[SettingsT]):
         """Forces on the degrees of freedom during the step from `state` [N, N m], (W, nv); None for none."""
         return None
 
+    def reference_qpos(self) -> Tensor | None:
+        """Positions (W, nq) of a second body that films draw pale beside the one in `self.state`, such as the
+        motion that it follows; None: there is none."""
+        return None
+
     def remember(self, state: StepState, action: Tensor) -> Mapping[str, Tensor]:
         """All memories, (W, size), once `action` has led to `state`. Called once a step, before `observe`.
 

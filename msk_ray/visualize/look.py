@@ -16,6 +16,10 @@ _ARROW = 2.0
 """Size of an arrow for a force equal to the whole weight, in units of the model's extent. MuJoCo draws half of it."""
 
 
+_REFERENCE = (0.82, 0.85, 0.92, 1.0)
+"""Colour of a reference. MuJoCo would blend a transparent one with black where there is no background."""
+_REFERENCE_SHIFT = np.array([0.0, 0.8, 0.0])
+"""From where a reference is to where it is drawn, so that it can be told from the body that follows it [m]."""
 DRAWN_GROUPS = (0, 1, 2)
 """Groups of geoms that MuJoCo draws by default."""
 _HEADLIGHT = {"ambient": 0.35, "diffuse": 0.55, "specular": 0.2}
@@ -57,6 +61,24 @@ class Look:
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE] = True
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = True
         option.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = True
+
+    def add_reference(self, scene: mujoco.MjvScene, qpos: np.ndarray, option: mujoco.MjvOption) -> None:
+        """Add the moving bodies once more to a scene, pale, in other positions and to the side.
+
+        Args:
+            qpos: shape (nq,).
+        """
+        data = mujoco.MjData(self._model)
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, data)
+        first = scene.ngeom
+        bodies = mujoco.MjvOption()
+        bodies.geomgroup = option.geomgroup
+        moving = int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
+        mujoco.mjv_addGeoms(self._model, data, bodies, mujoco.MjvPerturb(), moving, scene)
+        for geom in scene.geoms[first : scene.ngeom]:
+            geom.pos += _REFERENCE_SHIFT
+            geom.rgba[:] = _REFERENCE
 
     def colour(self, act: np.ndarray) -> None:
         """Colour every muscle's tendon by its activation; with several muscles on a tendon, by the most active one.

@@ -29,6 +29,8 @@ class Recording:
     """Shape (T + 1, W, nu); the last row repeats the one before."""
     applied: Tensor | None
     """Forces on the degrees of freedom [N, N m] during each step, shape (T + 1, W, nv); None for none."""
+    reference: Tensor | None = None
+    """`reference_qpos` in each state, shape (T + 1, W, nq); None for none."""
 
     @property
     def count(self) -> int:
@@ -43,7 +45,8 @@ class Recording:
         """The states of one episode, the first and the last included."""
         steps = slice(0, self.length(world) + 1)
         qpos, qvel, act, ctrl = (t[steps, world].double().numpy() for t in (*self.states, self.controls))
-        return States(self.model, qpos, qvel, act, ctrl)
+        reference = None if self.reference is None else self.reference[steps, world].double().numpy()
+        return States(self.model, qpos, qvel, act, ctrl, reference)
 
     def frames_at(self, world: int, fps: float) -> States:
         """One episode's states, `fps` per second of simulated time."""
@@ -68,8 +71,11 @@ def record(bench: Bench, policy: SavedPolicy, request: Request) -> Recording:
     states: list[StepState] = []
     controls: list[Tensor] = []
     forces: list[Tensor] = []
+    references: list[Tensor] = []
 
     def keep(state: StepState, control: Tensor) -> None:
+        if (reference := env.reference_qpos()) is not None:
+            references.append(reference.cpu())
         state = env.disturbed(state)
         states.append(StepState(*(t.cpu() for t in state)))
         controls.append(control.cpu())
@@ -87,4 +93,5 @@ def record(bench: Bench, policy: SavedPolicy, request: Request) -> Recording:
         StepState(*(torch.stack(parts) for parts in zip(*states, strict=True))),
         torch.stack(controls),
         torch.stack(forces) if forces else None,
+        torch.stack(references) if references else None,
     )

@@ -35,13 +35,18 @@ class States:
     """Shape (F, na)."""
     ctrl: np.ndarray
     """Shape (F, nu)."""
+    reference: np.ndarray | None = None
+    """Positions of a second body, drawn pale beside the first, shape (F, nq); None: there is none."""
 
     def __len__(self) -> int:
         return len(self.qpos)
 
     def at(self, indices: np.ndarray) -> "States":
         """The states at some indices."""
-        return States(self.model, self.qpos[indices], self.qvel[indices], self.act[indices], self.ctrl[indices])
+        reference = None if self.reference is None else self.reference[indices]
+        return States(
+            self.model, self.qpos[indices], self.qvel[indices], self.act[indices], self.ctrl[indices], reference
+        )
 
 
 @dataclass(frozen=True)
@@ -102,7 +107,8 @@ def frames(states: States, view: View) -> Iterator[np.ndarray]:
     with tempfile.TemporaryDirectory() as scratch, (Path(scratch) / "errors").open("w+b") as errors:
         model, arrays = Path(scratch) / "model.mjb", Path(scratch) / "states.npz"
         mujoco.mj_saveModel(states.model, str(model))
-        np.savez(arrays, qpos=states.qpos, qvel=states.qvel, act=states.act, ctrl=states.ctrl)
+        reference = {} if states.reference is None else {"reference": states.reference}
+        np.savez(arrays, qpos=states.qpos, qvel=states.qvel, act=states.act, ctrl=states.ctrl, **reference)
         command = [sys.executable, "-m", "msk_ray.visualize.worker", str(model), str(arrays)]
         groups = "".join(map(str, geom_groups(states.model) if view.groups is None else view.groups))
         process = subprocess.Popen(

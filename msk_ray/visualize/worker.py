@@ -42,13 +42,16 @@ def draw(
     """Write a frame (height, width, 3) of bytes for each state.
 
     Args:
-        states: `qpos` (F, nq), `qvel` (F, nv), `act` (F, na), `ctrl` (F, nu).
+        states: `qpos` (F, nq), `qvel` (F, nv), `act` (F, na), `ctrl` (F, nu), and perhaps `reference` (F, nq), the
+            positions of a second, pale body.
         groups: of geoms to draw.
         camera: name; empty for the default one.
     """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
     data = mujoco.MjData(model)
+    states = dict(states)
+    references = states.pop("reference", None)
     look = Look(model)
     option = mujoco.MjvOption()
     look.switch_on(option, groups)
@@ -62,6 +65,8 @@ def draw(
             mujoco.mj_forward(model, data)
             look.colour(data.act)
             renderer.update_scene(data, view, option)
+            if references is not None:
+                look.add_reference(renderer.scene, references[number], option)
             frame = renderer.render()
             if not sky:
                 # Drawn again as depth, which tells where nothing was drawn: there goes the sky.

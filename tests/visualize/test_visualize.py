@@ -166,6 +166,19 @@ def test_contact_forces_are_drawn(drawing: str) -> None:
     assert arrows[1] == 0
 
 
+def test_a_reference_is_drawn_pale_and_to_the_side(drawing: str) -> None:
+    model = mujoco.MjModel.from_xml_string(RESTING)
+    body = np.array([[0, 0, 0.048, 1, 0, 0, 0]], dtype=float)
+    rest = np.zeros((1, 6)), np.zeros((1, 0)), np.zeros((1, 0))
+    (alone,) = frames(States(model, body, *rest), View(160, 120))
+    (both,) = frames(States(model, body, *rest, reference=body), View(160, 120))
+    changed = (alone != both).any(-1)
+    assert changed.any()
+    assert not changed[60, 80], "the body itself stays"
+    pale = both[changed].astype(int)
+    assert (pale.max(-1) - pale.min(-1) < 60).mean() > 0.9
+
+
 def test_models_without_sky_or_light_are_drawn_on_a_bright_day(drawing: str) -> None:
     dark = RESTING.replace('<light pos="0 -2 2" dir="0 1 -1"/>', "")
     body = np.array([[0, 0, 0.5, 1, 0, 0, 0]], dtype=float)

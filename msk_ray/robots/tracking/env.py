@@ -255,6 +255,13 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         frames = self.frames(state)
         return torch.cat((frames.position(self.anchor), frames.orientation(self.anchor)), dim=-1)
 
+    def reference_qpos(self) -> Tensor:
+        """The reference's pose in the current state."""
+        frame = self.frame()
+        base = self.references.bodies(frame)
+        angles = self.references.joints(frame)[:, : self.action_size]
+        return torch.cat((base.position[:, 0], base.orientation[:, 0], angles), dim=-1)
+
     def mjlab_action(self, action: Tensor) -> Tensor:
         if self.config.action_about == "default":
             return super().mjlab_action(action)

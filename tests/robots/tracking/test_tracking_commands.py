@@ -2,6 +2,9 @@
 
 import csv
 import json
+import re
+import runpy
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from msk_ray.config import parse_config
+from msk_ray.cli import run
+from msk_ray.config import load_config, parse_config
 from msk_ray.diagnose.__main__ import main as diagnose
 from msk_ray.errors import ConfigError, DeviceError
+from msk_ray.export.__main__ import main as export
 from msk_ray.robots.tracking import clip_scores, list_motions, track
 from msk_ray.robots.tracking.clip_scores import ClipScore, follow_clips, totals
+from msk_ray.training import Trainer, load_policy
 from msk_ray.visualize import render
 
 
@@ -105,6 +111,27 @@ def test_track_writes_a_row_for_each_clip(
     written = json.loads((tmp_path / "clips.json").read_text())
     assert (written["layout"], written["epoch"]) == ("no_state_estimation", 3)
     assert written["clips"][0]["normalised_return"] == 0.3
+
+
+def test_an_exported_policy_follows_as_far_in_c_mujoco(
+    tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = ("env.nworld=2", "shac.horizon=2", "actor.hidden=[8]", "critic.hidden=[8]", "evaluation.nworld=1")
+    trainer = Trainer(load_config("g1_tracking", few), tmp_path / "trial", "cpu")
+    checkpoint = trainer.save()
+    trainer.close()
+    (score,) = follow_clips(load_policy(checkpoint), "cpu")
+    assert run(export, [str(checkpoint), "--onnx", str(tmp_path / "squat.onnx")]) == 0
+    assert list_motions.main(["builtin:squat", "--strip", "none", "--npz", str(tmp_path)]) == 0
+    example = root / "docs" / "examples" / "run_tracking.py"
+    assert "import msk_ray" not in example.read_text()
+    monkeypatch.setattr(sys, "argv", [example.name, str(tmp_path / "squat.onnx"), str(tmp_path / "squat.npz")])
+    capsys.readouterr()
+    runpy.run_path(str(example), run_name="__main__")
+    found = re.search(r"followed (\d+)%, motion ([\d.]+)", capsys.readouterr().out)
+    assert found is not None
+    assert float(found[1]) / 100.0 == pytest.approx(score.followed, abs=0.02)
+    assert float(found[2]) == pytest.approx(score.normalised_motion, rel=0.02)
 
 
 def test_gradients_along_a_motion_match_float64_differences(tmp_path: Path, root: Path) -> None:
