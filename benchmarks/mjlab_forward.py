@@ -1,7 +1,7 @@
 """Time of mjlab's own forward env step of the robots, to compare with benchmarks/robots.py on the same machine.
 
-    PYTHON_OF_MJLAB benchmarks/mjlab_forward.py                                      # Go1 with 8192 worlds, G1 with 4096
-    PYTHON_OF_MJLAB benchmarks/mjlab_forward.py --worlds 4 --device cpu --steps 1    # a try
+    PYTHON_OF_MJLAB benchmarks/mjlab_forward.py                                    # Go1 with 8192 worlds, G1 with 4096
+    PYTHON_OF_MJLAB benchmarks/mjlab_forward.py --worlds 4 --device cpu --steps 1  # a try
 
 It runs in a Python that has mjlab, and imports nothing of the package. The worlds begin after 15 env steps under random
 actions of deviation 0.3 about the default pose. `physics` is four steps of mjlab's simulation, recorded as a graph, and

@@ -60,7 +60,9 @@ def main() -> None:
     s = commands.add_parser("score", help="score the policies in a folder")
     s.add_argument("folder", type=Path)
     s.add_argument("--episodes", type=int, default=256, help="one in each world")
-    s.add_argument("--steps", type=int, default=1000, help="of an episode, 20 ms each; an episode ends earlier in a fall")
+    s.add_argument(
+        "--steps", type=int, default=1000, help="of an episode, 20 ms each; an episode ends earlier in a fall"
+    )
     s.add_argument("--sampling", choices=("start", "uniform"), default="start", help="where in a clip episodes begin")
     s.set_defaults(run=score)
     args = p.parse_args()

@@ -1,7 +1,7 @@
 """A policy that follows a motion, in C MuJoCo, without msk_ray: python run_tracking.py dance.onnx dance1_subject2.npz
 
-For g1_tracking with `layout: full`, `action_about: reference` and no `future_frames`. It writes how much of the clip was
-followed, and the normalised motion return of `msk-ray track`.
+For g1_tracking with `layout: full`, `action_about: reference` and no `future_frames`. It prints how much of the clip
+was followed, and the return without costs as `msk-ray track` does.
 """
 
 import json
@@ -68,7 +68,13 @@ for frame in range(frames):
     axes = data.xmat[robot[torso]].reshape(3, 3)
     offset = axes.T @ (reference["pos"][frame, torso] - data.xpos[robot[torso]])
     obs = [clip["joint_pos"][frame], clip["joint_vel"][frame], offset, (axes.T @ turns[frame, torso])[:, :2].ravel()]
-    obs += [data.sensor("imu_lin_vel").data, data.sensor("imu_ang_vel").data, data.qpos[7:] - default, data.qvel[6:], action]
+    obs += [
+        data.sensor("imu_lin_vel").data,
+        data.sensor("imu_ang_vel").data,
+        data.qpos[7:] - default,
+        data.qvel[6:],
+        action,
+    ]
     (output,) = policy.run(["action"], {"obs": np.concatenate(obs)[None].astype(np.float32)})
     action = largest_action * output[0] + (clip["joint_pos"][frame] - default) / unit
     data.ctrl[servos] = default + unit * action

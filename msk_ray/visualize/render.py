@@ -107,8 +107,8 @@ def frames(states: States, view: View) -> Iterator[np.ndarray]:
     with tempfile.TemporaryDirectory() as scratch, (Path(scratch) / "errors").open("w+b") as errors:
         model, arrays = Path(scratch) / "model.mjb", Path(scratch) / "states.npz"
         mujoco.mj_saveModel(states.model, str(model))
-        reference = {} if states.reference is None else {"reference": states.reference}
-        np.savez(arrays, qpos=states.qpos, qvel=states.qvel, act=states.act, ctrl=states.ctrl, **reference)
+        reference = np.empty((0, states.model.nq)) if states.reference is None else states.reference
+        np.savez(arrays, qpos=states.qpos, qvel=states.qvel, act=states.act, ctrl=states.ctrl, reference=reference)
         command = [sys.executable, "-m", "msk_ray.visualize.worker", str(model), str(arrays)]
         groups = "".join(map(str, geom_groups(states.model) if view.groups is None else view.groups))
         process = subprocess.Popen(

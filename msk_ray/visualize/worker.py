@@ -42,8 +42,8 @@ def draw(
     """Write a frame (height, width, 3) of bytes for each state.
 
     Args:
-        states: `qpos` (F, nq), `qvel` (F, nv), `act` (F, na), `ctrl` (F, nu), and perhaps `reference` (F, nq), the
-            positions of a second, pale body.
+        states: `qpos` (F, nq), `qvel` (F, nv), `act` (F, na), `ctrl` (F, nu); `reference`, the positions of a second,
+            pale body, (F, nq), or (0, nq) if there is none.
         groups: of geoms to draw.
         camera: name; empty for the default one.
     """
@@ -51,7 +51,7 @@ def draw(
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
     data = mujoco.MjData(model)
     states = dict(states)
-    references = states.pop("reference", None)
+    references = states.pop("reference")
     look = Look(model)
     option = mujoco.MjvOption()
     look.switch_on(option, groups)
@@ -65,7 +65,7 @@ def draw(
             mujoco.mj_forward(model, data)
             look.colour(data.act)
             renderer.update_scene(data, view, option)
-            if references is not None:
+            if len(references):
                 look.add_reference(renderer.scene, references[number], option)
             frame = renderer.render()
             if not sky:

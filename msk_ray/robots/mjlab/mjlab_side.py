@@ -1,9 +1,9 @@
 """Runs episodes of an unmodified task of mjlab for `scoring`, in a Python that has mjlab.
 
 That Python has another version of MuJoCo and lacks this package, so this file imports nothing from it. It is started
-with one JSON argument {task, seed, worlds, steps, pushed, motion, sampling}. On standard output it writes a line of JSON that
-says what it runs, then the first observations of all worlds, and after each step a `record` of each world. On standard
-input it reads the actions of all worlds before each step. mjlab's own messages go to standard error.
+with one JSON argument {task, seed, worlds, steps, pushed, motion, sampling}. On standard output it writes a line of
+JSON that says what it runs, then the first observations of all worlds, and after each step a `record` of each world. On
+standard input it reads the actions of all worlds before each step. mjlab's own messages go to standard error.
 """
 
 import importlib.metadata
