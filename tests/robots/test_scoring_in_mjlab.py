@@ -134,7 +134,9 @@ def test_figures_match_those_worked_out_by_hand(
     assert pushed["length"]["min"] == 3.0
     assert pushed["mjlab"]["mjlab"] == "1.6.0"
     assert not pushed["canonical"]
-    assert "under mjlab pushed physics: 2 worlds, seeds 0,1, 5 steps, on cpu" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "mjlab pushed: 2 episodes with seed 1" in printed
+    assert "under mjlab pushed physics: 2 worlds, seeds 0,1, 5 steps, on cpu" in printed
 
 
 def test_what_mjlab_cannot_evaluate_is_refused_in_one_line(

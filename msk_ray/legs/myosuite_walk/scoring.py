@@ -20,6 +20,7 @@ from msk_ray.legs.myosuite_walk.config import MyoSuiteWalkSettings
 from msk_ray.legs.myosuite_walk.declaration import MYOSUITE
 from msk_ray.legs.myosuite_walk.mirror import WalkMirror
 from msk_ray.legs.myosuite_walk.model import build_myosuite_walk
+from msk_ray.progress import Pace
 from msk_ray.training import SavedPolicy
 from msk_ray.training.evaluation_tally import Episodes
 from msk_ray.training.threads import use_threads
@@ -122,7 +123,11 @@ class _MyoSuiteProcess(ForeignProcess):
 
     def episodes(self, act: _Act, count: int, steps: int) -> Episodes:
         """`count` episodes of at most `steps` steps, one after the other, as a tensor entry each."""
-        found = [self._episode(act, steps) for _ in range(count)]
+        found: list[np.ndarray] = []
+        pace = Pace("episodes", count)
+        while len(found) < count:
+            found.append(self._episode(act, steps))
+            pace(len(found))
         last = [episode[-1] for episode in found]
 
         def summed(name: str) -> torch.Tensor:

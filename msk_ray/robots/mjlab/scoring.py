@@ -19,6 +19,7 @@ from msk_ray.config import Config
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.foreign_process import ForeignProcess
 from msk_ray.evaluate.measure import EvaluationSetup, Request, entry_of
+from msk_ray.progress import Pace, announce
 from msk_ray.robots.config import ServoSettings
 from msk_ray.robots.mjlab import mjlab_side
 from msk_ray.robots.mjlab.declaration import MJLAB
@@ -147,6 +148,7 @@ class MjlabScorer:
         runs = []
         with motion_of(policy.config) as motion:
             for seed in seeds:
+                announce(f"{request.physics}: {request.worlds} episodes with seed {seed}; its kernels may come first")
                 with _MjlabProcess(self._python, {**order, "seed": seed, "motion": motion}) as process:
                     runs.append(process.episodes(policy))
         setup = EvaluationSetup(request.physics, False, request.worlds, seeds, request.steps, process.device)
@@ -184,7 +186,9 @@ class _MjlabProcess(ForeignProcess):
         length = np.zeros(worlds)
         summed = ("reward", "terms", *self._errors)
         sums = {name: np.zeros((worlds, *self._record[name].shape)) for name in summed}
-        for _ in range(self._order["steps"]):
+        steps = self._order["steps"]
+        pace = Pace("env steps at most", steps)
+        for done in range(1, steps + 1):
             self.write(actions(obs, policy(obs)))
             step = self.read(self._record, worlds)
             length += running
@@ -195,6 +199,7 @@ class _MjlabProcess(ForeignProcess):
                 total[counted] += step[name][counted]
             fell |= ended
             running &= ~ended
+            pace(done)
             if not running.any():
                 break
             obs = np.ascontiguousarray(step["obs"])
