@@ -1,11 +1,16 @@
-"""A policy that follows a motion, in C MuJoCo, without msk_ray: python run_tracking.py dance.onnx dance1_subject2.npz
+"""A policy that follows a motion, in C MuJoCo, without msk_ray; it needs onnxruntime, and two minutes for the dance:
 
-For g1_tracking with `layout: full`, `action_about: reference` and no `future_frames`. It prints how much of the clip
-was followed, and the return without costs as `msk-ray track` does.
+    msk-ray export g1_dance --onnx dance.onnx
+    msk-ray motions g1/dance1_subject2.csv --npz .
+    python run_tracking.py dance.onnx dance1_subject2.npz
+
+For policies with the observation and actions of configs/g1_tracking.yaml. Prints how much of the clip was followed, and
+`motion`, the return without costs, as `msk-ray track` does.
 """
 
 import json
 import sys
+import time
 from pathlib import Path
 
 import mujoco
@@ -17,13 +22,17 @@ for side in ("left", "right"):
     BODIES += [f"{side}_{part}_link" for part in ("hip_roll", "knee", "ankle_roll")]
     BODIES += [f"{side}_{part}_link" for part in ("shoulder_roll", "elbow", "wrist_yaw")]
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 path, clip = Path(sys.argv[1]), np.load(sys.argv[2])
 about = json.loads(path.with_suffix(".json").read_text())
+if about["observation"]["size"] != 160:
+    sys.exit(f"{path}: not for this layout: train with env.layout full and without env.future_frames")
 model = mujoco.MjModel.from_binary_path(str(path.with_suffix(".mjb")))
 policy = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 data = mujoco.MjData(model)
 robot = [model.body(name).id for name in BODIES]
-first = model.body("pelvis").id  # the clip has the robot's bodies in this order, from the pelvis on
+first = model.body("pelvis").id  # the clip has all bodies of the robot in the model's order, from the pelvis on
 reference = {name: clip[f"body_{name}_w"][:, np.array(robot) - first] for name in ("pos", "quat", "lin_vel", "ang_vel")}
 torso = BODIES.index("torso_link")
 joints = [model.joint(name).id for name in about["action"]["names"]]
@@ -54,6 +63,7 @@ def angle(a, b):
 
 
 def closeness(square, spread):
+    """1 where squares of differences are 0, falling over the spread, which is mjlab's."""
     return np.exp(-np.mean(square) / spread**2)
 
 
@@ -61,9 +71,12 @@ turns = matrix(reference["quat"])
 data.qpos[:3], data.qpos[3:7], data.qpos[7:] = reference["pos"][0, 0], reference["quat"][0, 0], clip["joint_pos"][0]
 data.qvel[:3], data.qvel[3:6] = reference["lin_vel"][0, 0], turns[0, 0].T @ reference["ang_vel"][0, 0]
 data.qvel[6:] = clip["joint_vel"][0]
-action = (clip["joint_pos"][0] - default) / unit
-frames, total = len(clip["joint_pos"]), 0.0
+action = (clip["joint_pos"][0] - default) / unit  # as if the last one had asked for the first pose
+frames, total, shown = len(clip["joint_pos"]), 0.0, time.monotonic()
 for frame in range(frames):
+    if time.monotonic() > shown + 10.0:
+        shown = time.monotonic()
+        print(f"  {frame} of {frames} frames", flush=True)
     mujoco.mj_forward(model, data)
     axes = data.xmat[robot[torso]].reshape(3, 3)
     offset = axes.T @ (reference["pos"][frame, torso] - data.xpos[robot[torso]])
@@ -84,6 +97,7 @@ for frame in range(frames):
     velocity = np.zeros((len(robot), 6))
     for row, body in zip(velocity, robot, strict=True):
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, row, 0)
+    # As in mjlab, the state after the step is compared with the frame that the policy saw before it.
     place, turn = reference["pos"][frame], turns[frame]
     if abs(place[0, 2] - position[0, 2]) > 0.25 or abs(turn[0, 2, 2] - rotation[0, 2, 2]) > 0.8:
         break

@@ -64,7 +64,8 @@ class PolicyToControl(nn.Module):
             self.remarks.append(f"no ctrl: `control` reads {_quoted(lost)}, which the file cannot carry")
         if self.memory.outside:
             self.remarks.append(
-                f"entries of obs depend on {_quoted(self.memory.outside)}, which the file cannot carry: give them too"
+                f"entries of obs show {_quoted(self.memory.outside)}, which the file cannot carry: your program has to "
+                "keep it and pass these entries"
             )
         self._sizes = [len(start) for start in self.memory.start.values()]
         self._order = torch.tensor([*self.memory.given, *self.memory.shown]).argsort()

@@ -89,7 +89,9 @@ def test_what_it_can_carry_is_inside_and_the_rest_is_given() -> None:
     assert policy.memory.shown == [0, 1, 2]
     assert policy.memory.given == [3, 4, 5, 6, 7, 8]
     assert [each.start.tolist() for each in policy.carried] == [[0.25], [0.0], [0.0, 0.0]]
-    assert policy.remarks == ["entries of obs depend on 'height', which the file cannot carry: give them too"]
+    assert policy.remarks == [
+        "entries of obs show 'height', which the file cannot carry: your program has to keep it and pass these entries"
+    ]
     assert not env.measurements.ignore_contact_forces
     inputs = policy.examples(observations(env, 0), 0)
     for write in (network.to_onnx, network.to_torchscript):
@@ -116,7 +118,8 @@ def test_a_memory_that_is_no_matrix_product_is_given_and_controls_that_need_it_a
     assert policy.memory.given == [0, 3, 4, 5, 6, 7, 8]
     assert policy.remarks == [
         "no ctrl: `control` reads 'force', which the file cannot carry",
-        "entries of obs depend on 'force' and 'height', which the file cannot carry: give them too",
+        "entries of obs show 'force' and 'height', which the file cannot carry: your program has to keep it and pass "
+        "these entries",
     ]
 
 

@@ -48,7 +48,8 @@ def follow_clips(
     Args:
         policy: a policy of `g1_tracking`.
         device: "cpu" or "cuda:N".
-        motion: clips to follow, as in `env.motion`; None: those that the policy was trained on.
+        motion: clips to follow, as in `env.motion`; None: those that the policy was trained on. `env.cut` and
+            `env.mirror` stay those of its training.
         pace: makes a progress display for a number of env steps; the display is called after each step with the number
             of steps done.
 
@@ -97,20 +98,22 @@ def _evaluation_config(policy: SavedPolicy, motion: str | None) -> Config:
 def totals(scores: list[ClipScore]) -> dict[str, Any]:
     """Number, duration [s] and failures of all clips, and means of the other figures over clips.
 
-    `by_time` is the mean of `normalised_return` over frames instead of clips.
+    `normalised_return_by_frame` is the mean of `normalised_return` over frames instead of clips.
     """
     seconds = sum(score.seconds for score in scores)
     figures = ("followed", "normalised_return", "normalised_motion", "mpkpe", "r_mpkpe")
     means = {name: sum(getattr(score, name) for score in scores) / len(scores) for name in figures}
-    by_time = sum(score.normalised_return * score.seconds for score in scores) / seconds
+    by_frame = sum(score.normalised_return * score.seconds for score in scores) / seconds
     failed = sum(score.failed for score in scores)
-    return {"clips": len(scores), "seconds": seconds, "failed": failed, **means, "by_time": by_time}
+    every = {"clips": len(scores), "seconds": seconds, "failed": failed}
+    return every | means | {"normalised_return_by_frame": by_frame}
 
 
-def as_json(scores: list[ClipScore], policy: SavedPolicy) -> dict[str, Any]:
-    """The content of `clips.json`."""
+def as_json(scores: list[ClipScore], policy: SavedPolicy, motion: str | None) -> dict[str, Any]:
+    """The content of `clips.json`. `motion` is as for `follow_clips`."""
     env = policy.config.env
     assert isinstance(env, G1TrackingSettings)
     origin = {"checkpoint": policy.path.name, "epoch": policy.epoch, "env_steps": policy.env_steps}
+    clips = {"motion": motion or env.motion, "cut": env.cut, "mirror": env.mirror}
     observation = {"layout": env.layout, "future_frames": list(env.future_frames)}
-    return {**origin, **observation, "totals": totals(scores), "clips": [asdict(score) for score in scores]}
+    return {**origin, **clips, **observation, "totals": totals(scores), "clips": [asdict(score) for score in scores]}

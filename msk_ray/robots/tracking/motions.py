@@ -181,7 +181,8 @@ def motion_files(where: str) -> list[Path]:
         return files
     if not path.is_file():
         known = ", ".join(f"{BUILTIN}{name}" for name in BUILTIN_MOTIONS)
-        raise ConfigError(f"no motion {brief(where)}: write a file .csv or .npz, a folder of them, or {known}")
+        place = "" if path.is_absolute() else f" in {Path.cwd()}"
+        raise ConfigError(f"no motion {brief(where)}{place}: write a file .csv or .npz, a folder of them, or {known}")
     return [path]
 
 

@@ -65,7 +65,7 @@ def test_files_without_a_motion_of_this_robot_are_refused(tmp_path: Path, model:
     np.savez(tmp_path / "bad.npz", fps=np.array([50.0]))
     with pytest.raises(ConfigError, match="body_pos_w"):
         read_motion(tmp_path / "bad.npz", model)
-    with pytest.raises(ConfigError, match=r"no motion 'jump': write a file .* or builtin:squat"):
+    with pytest.raises(ConfigError, match=r"no motion 'jump' in /.*: write a file .* or builtin:squat"):
         read_motions("jump", model)
     with pytest.raises(ConfigError, match="the built-in ones are builtin:squat"):
         read_motions("builtin:jump", model)

@@ -87,7 +87,7 @@ def test_totals_are_means_over_clips_and_over_time() -> None:
     every = totals(scores)
     assert (every["clips"], every["failed"], every["seconds"]) == (2, 1, 40.0)
     assert every["normalised_return"] == pytest.approx(0.6)
-    assert every["by_time"] == pytest.approx((10.0 * 0.9 + 30.0 * 0.3) / 40.0)
+    assert every["normalised_return_by_frame"] == pytest.approx((10.0 * 0.9 + 30.0 * 0.3) / 40.0)
 
 
 def test_track_writes_a_row_for_each_clip(
@@ -111,6 +111,10 @@ def test_track_writes_a_row_for_each_clip(
     written = json.loads((tmp_path / "clips.json").read_text())
     assert (written["layout"], written["epoch"]) == ("no_state_estimation", 3)
     assert written["clips"][0]["normalised_return"] == 0.3
+    assert written["motion"] == "builtin:squat"
+    assert track.main([str(checkpoint), "--motion", "other"]) == 0
+    assert capsys.readouterr().out.endswith("not written: add --out DIR\n")
+    assert json.loads((tmp_path / "clips.json").read_text()) == written
 
 
 def test_an_exported_policy_follows_as_far_in_c_mujoco(
