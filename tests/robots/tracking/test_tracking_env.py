@@ -66,6 +66,7 @@ def test_without_noise_a_world_begins_exactly_on_its_reference() -> None:
     deviation = env.deviation(env.state.physics)
     for part in deviation:
         assert part.abs().max() < 2e-3
+    torch.testing.assert_close(env.reference_qpos(), env.state.physics.qpos, atol=1e-5, rtol=0.0)
     assert not env.fell(env.state.physics).any()
 
 
