@@ -41,8 +41,8 @@ TASKS: Final = {
 }
 """mjlab's task for each environment, by its name: a class derived from one may be another robot with as many joints."""
 PLAY: Final = "mjlab play"
-"""mjlab's settings for playing: friction, encoder bias and centre of mass are random. Episodes along a motion begin where
-`env.score_sampling` says."""
+"""mjlab's settings for playing: friction, encoder bias and centre of mass are random. Episodes along a motion begin
+where `env.score_sampling` says."""
 PUSHED: Final = "mjlab pushed"
 """The same with the pushes and the noise of mjlab's training."""
 EPISODES_ON_GPU: Final = 256
