@@ -10,36 +10,15 @@ nothing else; `environment` is its env step with actuators, rewards, observation
 
 import argparse
 import os
-import statistics
-import time
-from collections.abc import Callable
 
 os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is drawn
 
 import torch
+from clock import milliseconds
 from mjlab.envs import ManagerBasedRlEnv
 from mjlab.tasks.registry import load_env_cfg
 
 TASKS = {"Mjlab-Velocity-Flat-Unitree-Go1": 8192, "Mjlab-Velocity-Flat-Unitree-G1": 4096}
-ROUNDS = 3
-
-
-def milliseconds(step: Callable[[], object], device: str, repeats: int) -> float:
-    """Median time of a step [ms]."""
-
-    def now() -> float:
-        if device != "cpu":
-            torch.cuda.synchronize(device)
-        return time.perf_counter()
-
-    step()
-    taken = []
-    for _ in range(ROUNDS):
-        begin = now()
-        for _ in range(repeats):
-            step()
-        taken.append(1e3 * (now() - begin) / repeats)
-    return statistics.median(taken)
 
 
 @torch.inference_mode()
@@ -59,7 +38,7 @@ def measure(task: str, args: argparse.Namespace) -> None:
 
     last = 0.3 * torch.randn(worlds, actions, device=args.device)
     for name, step in (("environment", lambda: env.step(last)), ("physics", physics)):
-        taken = milliseconds(step, args.device, args.steps)
+        taken = milliseconds(step, torch.device(args.device), args.steps)
         print(f"{task} {worlds} worlds, {name}: {taken:.2f} ms, {1e3 * worlds / taken:,.0f} env steps/s", flush=True)
     env.close()
 

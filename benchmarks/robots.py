@@ -9,15 +9,13 @@ let it converge.
 """
 
 import argparse
-import statistics
-import time
 import warnings
-from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
 
 import mujoco
 import torch
+from clock import milliseconds
 from record import RESULTS, markdown_table, publish
 from torch import Tensor
 
@@ -26,7 +24,6 @@ from msk_ray.step.forward import Kernels
 
 WORLDS = {"go1": 8192, "g1": 4096}
 SUBSTEPS = 4
-ROUNDS = 3
 DRAWN = 512
 """Worlds that are simulated for the start; the others repeat them."""
 VARIANTS = {
@@ -52,20 +49,6 @@ def start(model: mujoco.MjModel, worlds: int, device: str) -> list[Tensor]:
         ctrl = (middle + 0.3 * torch.randn(few, model.nu, generator=draws)).to(sim.device)
         state = sim.step(ctrl, *state)
     return [part.repeat(-(-worlds // few), 1)[:worlds].contiguous() for part in (ctrl, *state)]
-
-
-def milliseconds(step: Callable[[], object], device: torch.device, repeats: int) -> float:
-    """Median time of a step [ms]."""
-    taken = []
-    step()
-    for _ in range(ROUNDS):
-        begin = time.perf_counter()
-        for _ in range(repeats):
-            step()
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        taken.append(1e3 * (time.perf_counter() - begin) / repeats)
-    return statistics.median(taken)
 
 
 def measure(robot: str, variant: str, inputs: list[Tensor], args: argparse.Namespace) -> list[str]:

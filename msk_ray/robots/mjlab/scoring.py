@@ -143,9 +143,14 @@ class MjlabScorer:
         assert request.worlds is not None
         assert request.steps is not None
         seeds = request.seeds or (0,)
-        order = {"task": task, "pushed": request.physics == PUSHED, "worlds": request.worlds, "steps": request.steps}
         env = policy.config.env
-        order["sampling"] = env.score_sampling if isinstance(env, G1TrackingSettings) else None
+        order = {
+            "task": task,
+            "pushed": request.physics == PUSHED,
+            "worlds": request.worlds,
+            "steps": request.steps,
+            "sampling": env.score_sampling if isinstance(env, G1TrackingSettings) else None,
+        }
         runs = []
         with motion_of(policy.config) as motion:
             for seed in seeds:
