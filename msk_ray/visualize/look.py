@@ -62,15 +62,8 @@ class Look:
         option.flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = True
         option.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = True
 
-    def add_reference(self, scene: mujoco.MjvScene, qpos: np.ndarray, option: mujoco.MjvOption) -> None:
-        """Add the moving bodies once more to a scene, pale, in other positions and to the side.
-
-        Args:
-            qpos: shape (nq,).
-        """
-        data = mujoco.MjData(self._model)
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(self._model, data)
+    def add_reference(self, scene: mujoco.MjvScene, data: mujoco.MjData, option: mujoco.MjvOption) -> None:
+        """Add the moving bodies once more to a scene, pale and to the side, as they are in `data`."""
         first = scene.ngeom
         bodies = mujoco.MjvOption()
         bodies.geomgroup = option.geomgroup

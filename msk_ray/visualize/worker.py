@@ -49,7 +49,7 @@ def draw(
     """
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-    data = mujoco.MjData(model)
+    data, second = mujoco.MjData(model), mujoco.MjData(model)
     states = dict(states)
     references = states.pop("reference")
     look = Look(model)
@@ -66,7 +66,9 @@ def draw(
             look.colour(data.act)
             renderer.update_scene(data, view, option)
             if len(references):
-                look.add_reference(renderer.scene, references[number], option)
+                second.qpos[:] = references[number]
+                mujoco.mj_kinematics(model, second)
+                look.add_reference(renderer.scene, second, option)
             frame = renderer.render()
             if not sky:
                 # Drawn again as depth, which tells where nothing was drawn: there goes the sky.
