@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from msk_ray.config.rewards import reward_section, with_reward
 from msk_ray.config.sections import Count, Fraction, NonNegative, Reward, Text
@@ -72,6 +72,10 @@ class G1TrackingSettings(ServoSettings):
     failure: Failure = "mjlab"
     """When a training episode ends early: as in mjlab, when the height or tilt of the torso or the height of a hand or
     foot is far off (`mjlab`), or when the height or tilt of the pelvis is (`pelvis`)."""
+    drift_limit: PositiveFloat | None = None
+    """Training episodes also end when the torso is farther than this, horizontally, from the reference's [m]. Without
+    it, a robot that walks more slowly than a motion loses little, because the reward for the torso's position has no
+    slope far from it."""
     score_failure: Failure = "mjlab"
     """When a scored episode ends early."""
     reward: TrackingShape = TrackingShape()

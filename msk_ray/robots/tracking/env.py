@@ -121,7 +121,7 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
     @classmethod
     def reference_settings(cls, config: G1TrackingSettings) -> G1TrackingSettings:
         quiet = {"reset_noise": 0.0, "reset_velocity_noise": 0.0}
-        scored = {"sampling": config.score_sampling, "failure": config.score_failure}
+        scored = {"sampling": config.score_sampling, "failure": config.score_failure, "drift_limit": None}
         return super().reference_settings(config).model_copy(update={**scored, **quiet})
 
     # Episodes
@@ -174,6 +174,16 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         return transition
 
     def fell(self, state: StepState) -> Tensor:
+        off = self._is_posed_off(state)
+        limit = self.config.drift_limit
+        if limit is None:
+            return off
+        anchor = self.reference(state).position[:, self._anchor]
+        drift = (anchor - self.frames(state).position(self.anchor))[:, :2]
+        return off | (torch.linalg.vector_norm(drift, dim=-1) > limit)
+
+    def _is_posed_off(self, state: StepState) -> Tensor:
+        """Whether heights or tilts are far from the reference's, (W,) bool."""
         frames, reference = self.frames(state), self.reference(state)
         if self.config.failure == "pelvis":
             return self._is_off(state, reference, 0)

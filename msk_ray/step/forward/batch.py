@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from msk_ray.step.errors import ConfigError, UnsupportedModelError
-from msk_ray.step.forward.capacity import UNKNOWN, Capacity, default_capacity, geometric_bound, scalar_rows
+from msk_ray.step.forward.capacity import UNKNOWN, Capacity, convex_room, default_capacity, geometric_bound, scalar_rows
 from msk_ray.step.forward.contact_watch import ContactQuery, ContactWatch
 from msk_ray.step.forward.fused import FusedSolver, check_fused, choose_fused
 from msk_ray.step.forward.graph import joined_stream
@@ -167,7 +167,13 @@ class WorldBatch:
         self.nworld = nworld
         self.capacity = capacity
         with wp.ScopedDevice(self.device):
-            self.data = mjw.make_data(self.structure, nworld=nworld, nconmax=capacity.contacts, njmax=capacity.rows)
+            self.data = mjw.make_data(
+                self.structure,
+                nworld=nworld,
+                nconmax=capacity.contacts,
+                nccdmax=convex_room(self.structure, capacity.contacts),
+                njmax=capacity.rows,
+            )
             if capacity.rows == 0:
                 # Integrators read M qacc from the output of the solver, which mujoco_warp skips without rows: then it
                 # is the smooth force.

@@ -151,6 +151,23 @@ def default_capacity(model: mujoco.MjModel) -> tuple[Capacity, Capacity | None]:
     return (tried if bound is None else tried.at_most(bound)), bound
 
 
+def convex_room(model: mujoco.MjModel, contacts: int) -> int:
+    """Pairs of two types of geoms that mujoco_warp's convex collider can take at once, per world, if there is room for
+    `contacts`; worlds pool it.
+
+    As many as contacts, except on ground of height fields: there the broad phase, which has room for `contacts`, passes
+    many pairs with the boxes around the fields, but a geom lies over one field, rarely two. A pair takes 66 KB with 500
+    iterations, so this decides how many worlds fit on a GPU.
+    """
+    fields = model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD
+    if not fields.any():
+        return contacts
+    pairs = candidate_pairs(model, filtered=True)
+    on_fields = np.unique(pairs[fields[pairs].any(axis=1)])
+    of_a_type = np.bincount(model.geom_type[on_fields[~fields[on_fields]]], minlength=1).max()
+    return min(contacts, max(contacts // 4, _rounded(_MARGIN * of_a_type)))
+
+
 def _rounded(size: float) -> int:
     """Round up to a multiple of eight, so that models of similar size share compiled kernels."""
     return 8 * math.ceil(size / 8.0)

@@ -89,6 +89,19 @@ def test_networks_in_one_batch_fit_as_one_after_the_other(activation: str, grad_
     torch.testing.assert_close(*fitted, rtol=1e-5, atol=1e-6)
 
 
+def test_products_of_a_fit_are_tf32_and_those_after_it_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    critic = Critic(CriticConfig(hidden=(8,), count=2), 3, torch.Generator().manual_seed(0))
+    gradient = _Batched(critic, ALONE)
+    matmul = torch.backends.cuda.matmul
+    seen = []
+    monkeypatch.setattr(gradient, "_batched", lambda obs: seen.append(matmul.allow_tf32) or 1 / 0)
+    assert not matmul.allow_tf32
+    with pytest.raises(ZeroDivisionError):
+        gradient(torch.randn(5, 3), torch.randn(5))
+    assert seen == [True]
+    assert not matmul.allow_tf32
+
+
 def test_a_batch_computes_what_its_networks_are_loaded_with() -> None:
     critic, other = (Critic(CriticConfig(hidden=(8,), count=2), 3, torch.Generator().manual_seed(k)) for k in (0, 1))
     batched = BatchedCritic(critic)

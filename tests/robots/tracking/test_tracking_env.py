@@ -185,6 +185,21 @@ def test_a_tail_adds_a_share_of_the_reciprocal_to_motion_terms() -> None:
     assert values[1] == pytest.approx(0.5 * np.exp(-4.0) + 0.5 / 5.0, rel=1e-3)
 
 
+def test_far_from_the_torsos_place_a_training_episode_ends_but_a_scored_one_goes_on() -> None:
+    env = make(3, **STILL, drift_limit=0.5)
+    begin_at(env, [0, 0, 0])
+    qpos = env.state.physics.qpos.clone()
+    qpos[1, :2] += torch.tensor([0.3, 0.35])  # 0.46 m
+    qpos[2, :2] += torch.tensor([0.4, 0.35])  # 0.53 m
+    moved = env.state.physics._replace(qpos=qpos)
+    assert env.fell(moved).tolist() == [False, False, True]
+    scored = env.reference_settings(env.config)
+    assert scored.drift_limit is None
+    unlimited = make(3, **STILL)
+    begin_at(unlimited, [0, 0, 0])
+    assert not unlimited.fell(moved).any()
+
+
 def test_unknown_motions_and_empty_cuts_are_refused() -> None:
     with pytest.raises(ConfigError, match="no motion 'nowhere'"):
         make(1, motion="nowhere")

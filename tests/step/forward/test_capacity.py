@@ -11,7 +11,7 @@ from scenes import ant, cartpole, studded_plate
 from msk_ray.errors import SimulationError
 from msk_ray.step.adjoint.taped_step import TapedStep, WarpState
 from msk_ray.step.forward import WorldBatch, capacity
-from msk_ray.step.forward.capacity import Capacity, default_capacity, geometric_bound, probe
+from msk_ray.step.forward.capacity import Capacity, convex_room, default_capacity, geometric_bound, probe
 from msk_ray.step.forward.overflow import ITERATION_BITS, LOST_BITS, loss_error, needed
 
 
@@ -79,6 +79,21 @@ def test_of_a_geom_on_a_height_field_mujoco_warp_keeps_four_contacts():
     batch.data.qpos.assign(data.qpos[None].astype(np.float32))
     batch.launch_step()
     assert batch.data.nacon.numpy()[0] == 4
+
+
+def test_on_height_fields_the_convex_collider_has_room_for_the_geoms_over_one_field() -> None:
+    """Four fields, and a body of 20 capsules and a sphere: at 1.5 times 20, rounded up to 32."""
+    capsules = "".join(f'<geom type="capsule" size=".1 .2" pos="{i} 0 0"/>' for i in range(20))
+    fields = "".join(f'<geom type="hfield" hfield="h" pos="{2 * i} 0 0"/>' for i in range(4))
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><hfield name="h" nrow="3" ncol="3" size="1 1 .1 .1"/></asset><worldbody>
+        {fields}<body pos="0 0 1"><freejoint/>{capsules}<geom size=".1"/></body></worldbody></mujoco>"""
+    )
+    assert convex_room(model, 100) == 32
+    assert convex_room(model, 200) == 50, "a quarter of the contacts"
+    assert convex_room(model, 20) == 20, "no more than contacts"
+    assert WorldBatch(model, 2, 1, "cpu", capacity=Capacity(100, 64)).data.naccdmax == 2 * 32
+    assert convex_room(ant(), 17) == 17
 
 
 def test_without_a_bound_the_probe_decides():
