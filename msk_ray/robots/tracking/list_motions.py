@@ -1,5 +1,6 @@
 """`msk-ray motions`: lists motions, says what is wrong with them, and draws them."""
 
+import copy
 import shutil
 import sys
 from collections.abc import Sequence
@@ -104,11 +105,15 @@ def _read(where: str, model: "mujoco.MjModel") -> "tuple[list[Motion], list[str]
 
 def _draw(motions: "Sequence[Motion]", model: "mujoco.MjModel", count: int, path: Path) -> str:
     """Draw a row of `count` frames for each motion; returns a line that says where, or why not."""
+    import mujoco
     import numpy as np
 
     from msk_ray.visualize.film import grid
     from msk_ray.visualize.render import States, View, frames
 
+    # A clip has no forces: those of its overlapping parts would be drawn as arrows across the picture.
+    model = copy.copy(model)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     images, captions = [], []
     try:
         for motion in motions:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -49,6 +50,22 @@ def test_motions_are_listed_checked_and_drawn(
     assert lines[4] == "2 motions, 5 s (0.00 h)"
     assert lines[5].startswith(f"refused: {folder / 'none.csv'}: 3 numbers a frame, not 36")
     assert lines[6] == "nothing drawn: no OpenGL platform works without a display"
+
+
+def test_a_motion_is_drawn_without_arrows_of_forces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    contacts = []
+
+    def drawn(states: Any, view: Any) -> list[np.ndarray]:
+        data = mujoco.MjData(states.model)
+        data.qpos[:] = states.qpos[0]
+        data.qpos[2] -= 0.05  # both feet in the ground
+        mujoco.mj_forward(states.model, data)
+        contacts.append(data.ncon)
+        return [np.zeros((4, 4, 3), np.uint8) for _ in states.qpos]
+
+    monkeypatch.setattr(render, "frames", drawn)
+    assert list_motions.main(["builtin:squat", "--strip", str(tmp_path / "strip.png")]) == 0
+    assert contacts == [0]
 
 
 class Still:
