@@ -105,7 +105,7 @@ class _Gradient(Protocol):
 
 @contextmanager
 def tf32_products() -> Iterator[None]:
-    """CUDA's matrix products round their inputs to TF32, 11 bits of mantissa, in this context. For the fit alone: its
+    """CUDA's matrix products round their inputs to TF32, 10 bits of mantissa, in this context. For the fit alone: its
     targets are noisy by much more, while the policy's gradient is not."""
     before = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = True

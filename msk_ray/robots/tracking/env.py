@@ -178,8 +178,7 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
         limit = self.config.drift_limit
         if limit is None:
             return off
-        anchor = self.reference(state).position[:, self._anchor]
-        drift = (anchor - self.frames(state).position(self.anchor))[:, :2]
+        drift = self.deviation(state).anchor_position[:, :2]
         return off | (torch.linalg.vector_norm(drift, dim=-1) > limit)
 
     def _is_posed_off(self, state: StepState) -> Tensor:

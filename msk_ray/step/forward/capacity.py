@@ -22,6 +22,13 @@ _PROBE_WORK = 400_000
 """Limit on steps × cost of a step, in degrees of freedom plus a twentieth of the pairs. A time limit would not
 repeat."""
 _RANDOM_STARTS = 6
+_FEW_CONTACTS = [
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    mujoco.mjtGeom.mjGEOM_CYLINDER,
+    mujoco.mjtGeom.mjGEOM_MESH,
+    mujoco.mjtGeom.mjGEOM_SDF,
+]
+"""Types with which a pair may go through the convex collider and count as fewer than four contacts."""
 _CONTROL_INTERVAL = 0.05
 """How long a probe holds each random control [s]."""
 _LOOKS = 25
@@ -155,16 +162,21 @@ def convex_room(model: mujoco.MjModel, contacts: int) -> int:
     """Pairs of two types of geoms that mujoco_warp's convex collider can take at once, per world, if there is room for
     `contacts`; worlds pool it.
 
-    As many as contacts, except on ground of height fields: there the broad phase, which has room for `contacts`, passes
-    many pairs with the boxes around the fields, but a geom lies over one field, rarely two. A pair takes 66 KB with 500
-    iterations, so this decides how many worlds fit on a GPU.
+    As many as contacts, except on ground of height fields. A geom that touches a field counts as four contacts, and two
+    boxes as eight, so a quarter has room for all that touch; a geom over a field, rarely over two, is a pair even
+    before it touches. A pair takes 66 KB with 500 iterations, so this decides how many worlds fit on a GPU. Other
+    convex pairs may have one contact each: a model with any has as much room as contacts.
     """
     fields = model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD
     if not fields.any():
         return contacts
     pairs = candidate_pairs(model, filtered=True)
-    on_fields = np.unique(pairs[fields[pairs].any(axis=1)])
-    of_a_type = np.bincount(model.geom_type[on_fields[~fields[on_fields]]], minlength=1).max()
+    on_field = fields[pairs].any(axis=1)
+    on_plane = (model.geom_type[pairs] == mujoco.mjtGeom.mjGEOM_PLANE).any(axis=1)
+    if np.isin(model.geom_type[pairs[~on_field & ~on_plane]], _FEW_CONTACTS).any():
+        return contacts
+    over_fields = np.unique(pairs[on_field])
+    of_a_type = np.bincount(model.geom_type[over_fields[~fields[over_fields]]], minlength=1).max()
     return min(contacts, max(contacts // 4, _rounded(_MARGIN * of_a_type)))
 
 

@@ -96,6 +96,20 @@ def test_on_height_fields_the_convex_collider_has_room_for_the_geoms_over_one_fi
     assert convex_room(ant(), 17) == 17
 
 
+def test_convex_pairs_of_a_single_contact_keep_their_room_on_a_height_field() -> None:
+    """Ten ellipsoids in each other's way: 45 pairs, each one contact and one pair of the convex collider."""
+    bodies = "".join(
+        f'<body pos="0 0 {i}"><freejoint/><geom type="ellipsoid" size=".1 .2 .3"/></body>' for i in range(10)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><hfield name="h" nrow="3" ncol="3" size="1 1 .1 .1"/></asset><worldbody>
+        <geom type="hfield" hfield="h"/>{bodies}</worldbody></mujoco>"""
+    )
+    contacts = default_capacity(model)[0].contacts
+    assert contacts == 45 + 10 * 4
+    assert convex_room(model, contacts) == contacts
+
+
 def test_without_a_bound_the_probe_decides():
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><flexcomp name="cloth" type="grid" count="3 3 1"
