@@ -2,13 +2,15 @@
 
     msk-ray export g1_dance --onnx dance.onnx
     msk-ray motions g1/dance1_subject2.csv --npz .
-    python run_tracking.py dance.onnx dance1_subject2.npz
+    python run_tracking.py dance.onnx dance1_subject2.npz 2
 
-For policies with the observation and actions of configs/g1_tracking.yaml. Prints how much of the clip was followed, and
-`motion`, the return without costs, as `msk-ray track` does.
+For policies with actions about the reference and `env.layout: full`. The number is their `env.action_range`: 2 in
+configs/g1_tracking.yaml, 4 in configs/g1_tracking_library.yaml. Prints how much of the clip was followed, and `motion`,
+the return without costs, as `msk-ray track` does.
 """
 
 import json
+import re
 import sys
 import time
 from pathlib import Path
@@ -22,12 +24,14 @@ for side in ("left", "right"):
     BODIES += [f"{side}_{part}_link" for part in ("hip_roll", "knee", "ankle_roll")]
     BODIES += [f"{side}_{part}_link" for part in ("shoulder_roll", "elbow", "wrist_yaw")]
 
-if len(sys.argv) != 3:
+if len(sys.argv) != 4:
     sys.exit(__doc__)
-path, clip = Path(sys.argv[1]), np.load(sys.argv[2])
+path, clip, action_range = Path(sys.argv[1]), np.load(sys.argv[2]), float(sys.argv[3])
 about = json.loads(path.with_suffix(".json").read_text())
-if about["observation"]["size"] != 160:
-    sys.exit(f"{path}: not for this layout: train with env.layout full and without env.future_frames")
+shown = " ".join(entry["name"] for entry in about["observation"]["entries"])
+future = [int(ahead) for ahead in re.findall(r"\banchor_position_(\d+)_x\b", shown)]  # env.future_frames
+if about["observation"]["size"] != 160 + 67 * len(future):
+    sys.exit(f"{path}: not for this observation: train with env.layout full, without history")
 model = mujoco.MjModel.from_binary_path(str(path.with_suffix(".mjb")))
 policy = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 data = mujoco.MjData(model)
@@ -38,7 +42,6 @@ torso = BODIES.index("torso_link")
 joints = [model.joint(name).id for name in about["action"]["names"]]
 servos = [np.flatnonzero(model.actuator_trnid[:, 0] == joint)[0] for joint in joints]
 unit = 0.25 * model.actuator_forcerange[servos, 1] / model.actuator_gainprm[servos, 0]  # of mjlab's actions [rad]
-largest_action = 2.0  # env.action_range in configs/g1_tracking.yaml
 default = model.key_qpos[0, 7:]
 
 
@@ -67,29 +70,35 @@ def closeness(square, spread):
     return np.exp(-np.mean(square) / spread**2)
 
 
+def seen(frame):
+    """What the policy sees of the reference in a frame: joints, and the torso in the axes of the robot's."""
+    axes = data.xmat[robot[torso]].reshape(3, 3)
+    offset = axes.T @ (reference["pos"][frame, torso] - data.xpos[robot[torso]])
+    return [clip["joint_pos"][frame], clip["joint_vel"][frame], offset, (axes.T @ turns[frame, torso])[:, :2].ravel()]
+
+
 turns = matrix(reference["quat"])
 data.qpos[:3], data.qpos[3:7], data.qpos[7:] = reference["pos"][0, 0], reference["quat"][0, 0], clip["joint_pos"][0]
 data.qvel[:3], data.qvel[3:6] = reference["lin_vel"][0, 0], turns[0, 0].T @ reference["ang_vel"][0, 0]
 data.qvel[6:] = clip["joint_vel"][0]
 action = (clip["joint_pos"][0] - default) / unit  # as if the last one had asked for the first pose
-frames, total, shown = len(clip["joint_pos"]), 0.0, time.monotonic()
+frames, total, printed = len(clip["joint_pos"]), 0.0, time.monotonic()
 for frame in range(frames):
-    if time.monotonic() > shown + 10.0:
-        shown = time.monotonic()
+    if time.monotonic() > printed + 10.0:
+        printed = time.monotonic()
         print(f"  {frame} of {frames} frames", flush=True)
     mujoco.mj_forward(model, data)
-    axes = data.xmat[robot[torso]].reshape(3, 3)
-    offset = axes.T @ (reference["pos"][frame, torso] - data.xpos[robot[torso]])
-    obs = [clip["joint_pos"][frame], clip["joint_vel"][frame], offset, (axes.T @ turns[frame, torso])[:, :2].ravel()]
-    obs += [
+    obs = [
+        *seen(frame),
         data.sensor("imu_lin_vel").data,
         data.sensor("imu_ang_vel").data,
         data.qpos[7:] - default,
         data.qvel[6:],
         action,
+        *(part for ahead in future for part in seen(min(frame + ahead, frames - 1))),
     ]
     (output,) = policy.run(["action"], {"obs": np.concatenate(obs)[None].astype(np.float32)})
-    action = largest_action * output[0] + (clip["joint_pos"][frame] - default) / unit
+    action = action_range * output[0] + (clip["joint_pos"][frame] - default) / unit
     data.ctrl[servos] = default + unit * action
     mujoco.mj_step(model, data, about["physics_steps_per_control"])
     mujoco.mj_forward(model, data)

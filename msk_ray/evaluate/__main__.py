@@ -93,7 +93,9 @@ def parser() -> Parser:
         + ", ".join(f"{foreign_scoring(name).python}" for name in SCORINGS.known())
         + ")",
     )
-    p.add_argument("--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none)")
+    p.add_argument(
+        "--device", help="cpu or cuda:N (default: the first GPU, or the CPU if there is none); --in has its own"
+    )
     p.add_argument("--storage", **STORAGE)
     return p
 

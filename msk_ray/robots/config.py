@@ -68,7 +68,7 @@ class ServoSettings(MjcfSettings):
 
     action_range: PositiveFloat = 1.0
     """mjlab's action for a policy's action of 1. mjlab's actions have no bound; an action of 1 moves the target of a
-    servo so far that it starts with a quarter of its largest torque."""
+    servo so far that it starts with a quarter of its largest torque, so that 4 lets a policy ask for all of it."""
 
 
 @with_commands(VELOCITY)

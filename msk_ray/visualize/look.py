@@ -46,6 +46,9 @@ class Look:
                 model.tendon_width[tendon] = max(float(model.tendon_width[tendon]), width)
         model.vis.rgba.contactforce = FORCE
         model.vis.scale.forcewidth = 0.1
+        # Shadows of a directional light end a few metres from its position, which nothing else depends on.
+        suns = (model.light_bodyid == 0) & (model.light_type == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+        model.light_mode[suns] = mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
         if model.nlight == 0:
             for part, strength in _HEADLIGHT.items():
                 setattr(model.vis.headlight, part, [strength] * 3)

@@ -195,6 +195,20 @@ def test_models_without_sky_or_light_are_drawn_on_a_bright_day(drawing: str) -> 
     assert made[48, 80].min() > 90
 
 
+def test_the_sun_follows_a_body_so_that_its_shadow_is_drawn() -> None:
+    model = mujoco.MjModel.from_xml_string("""
+    <mujoco><worldbody>
+      <light pos="1 0 4" dir="0 0 -1" type="directional"/>
+      <light pos="2 0 4" dir="0 0 -1" type="spot"/>
+      <body pos="0 0 1"><freejoint/><geom size="0.1"/></body>
+    </worldbody></mujoco>""")
+    Look(model)
+    data = mujoco.MjData(model)
+    data.qpos[0] = 50.0
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.light_xpos, [[51.0, 0.0, 4.0], [2.0, 0.0, 4.0]])
+
+
 def test_a_robot_in_groups_that_are_not_drawn_is_shown(drawing: str) -> None:
     body = np.array([[0, 0, 0.3, 1, 0, 0, 0]], dtype=float)
 

@@ -9,7 +9,7 @@ from msk_ray.config.sections import Count, Fraction, NonNegative, Reward, Text
 from msk_ray.config.terms import Term, terms_in
 from msk_ray.robots.config import ServoSettings
 
-Sampling = Literal["adaptive", "uniform", "start"]
+Sampling = Literal["adaptive", "failure_rate", "uniform", "start"]
 Failure = Literal["mjlab", "pelvis"]
 Offset = Annotated[int, Field(ge=1, le=1000)]
 
@@ -65,8 +65,9 @@ class G1TrackingSettings(ServoSettings):
     action_about: Literal["default", "reference"] = "default"
     """Joint targets for an action of 0: the default pose, as in mjlab, or the reference's angles."""
     sampling: Sampling = "adaptive"
-    """Where training episodes begin: anywhere, but more often where episodes have failed (`adaptive`), anywhere
-    (`uniform`), or at the first frame of each motion (`start`)."""
+    """Where training episodes begin: anywhere, but more often where most episodes have failed (`adaptive`), or where
+    most of those that got there have (`failure_rate`); anywhere (`uniform`); or at the first frame of each motion
+    (`start`)."""
     score_sampling: Literal["uniform", "start"] = "uniform"
     """Where scored episodes begin."""
     failure: Failure = "mjlab"

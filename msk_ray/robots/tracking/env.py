@@ -167,10 +167,10 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
     def step(self, action: Tensor, *, auto_reset: bool = True) -> Transition:
         frame = self.frame()
         transition = super().step(action, auto_reset=auto_reset)
-        if self.config.sampling == "adaptive":
-            failed = self.start_frames.failed_in(frame, transition.terminated)
-            self.group.mean([failed])
-            self.start_frames.count(failed)
+        if self.config.sampling in ("adaptive", "failure_rate"):
+            tally = self.start_frames.tally(frame, transition.terminated)
+            self.group.mean([tally])
+            self.start_frames.count(tally)
         return transition
 
     def fell(self, state: StepState) -> Tensor:
@@ -358,7 +358,8 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
     # Checkpoints
 
     def state_dict(self) -> dict[str, Any]:
-        return {**super().state_dict(), "failures": self.start_frames.failures.clone()}
+        frames = self.start_frames
+        return {**super().state_dict(), "failures": frames.failures.clone(), "visits": frames.visits.clone()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         if state["failures"].shape != self.start_frames.failures.shape:
@@ -368,6 +369,7 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
             )
         super().load_state_dict(state)
         self.start_frames.failures.copy_(state["failures"])
+        self.start_frames.visits.copy_(state["visits"])
 
 
 def _rotation_between(start: Tensor, end: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import math
 import zlib
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple, Self
+from typing import Final, NamedTuple, Self
 
 import mujoco
 import numpy as np
@@ -22,7 +22,9 @@ _UNIFORM_SHARE = 0.1
 """Share of adaptive starts that are drawn anywhere. mjlab instead adds 0.1 to the failures that all worlds have in a
 step, so that its share depends on the number of worlds."""
 _NEWEST_WEIGHT = 0.001
-"""Weight of the newest env step in the running mean of failures."""
+"""Weight of the newest env step in the running means of failures and visits."""
+_LEAD: Final = 2
+"""A start by the failure rate may lie this many bins before the failures, so that the robot gets there by itself."""
 
 
 class Library(NamedTuple):
@@ -145,8 +147,10 @@ class References:
 class StartFrames:
     """Draws the frames in which episodes begin.
 
-    Clips are divided into bins of about a second. An adaptive draw prefers bins in which episodes have failed. Failures
-    are averaged in a tensor that is changed in place, so that epochs recorded as CUDA graphs count too.
+    Clips are divided into bins of about a second. An adaptive draw prefers bins in which many episodes have failed; one
+    by the failure rate prefers those in which many of the episodes that got there have, and the two bins before.
+    Failures and visits are averaged in tensors that are changed in place, so that epochs recorded as CUDA graphs count
+    too.
 
     Args:
         references: the clips.
@@ -155,6 +159,7 @@ class StartFrames:
 
     Attributes:
         failures: running mean of the failures in each bin per env step, (S,).
+        visits: running mean of the number of worlds in each bin, (S,).
     """
 
     def __init__(self, references: References, rate: float, sampling: Sampling) -> None:
@@ -176,15 +181,30 @@ class StartFrames:
         ]
         self._bin_of_frame = torch.from_numpy(np.concatenate(bins_of_frames)).to(device)
         self._share = (self._width / self._width.sum()).to(device)
+        last_bins = torch.from_numpy(first_bins).to(torch.int64) + torch.tensor(counts) - 1
+        ahead = torch.arange(len(clip))[:, None] + torch.arange(_LEAD + 1)
+        self._bins_ahead = torch.minimum(ahead, last_bins[clip][:, None]).to(device)
         self.failures = torch.zeros(len(clip), device=device)
+        self.visits = torch.zeros(len(clip), device=device)
 
     def chances(self) -> Tensor:
         """The probability that an episode begins in each bin, (S,)."""
+        if self._sampling == "failure_rate":
+            rates = self._share * self.failure_rates()[self._bins_ahead].mean(1)
+            return rates / rates.sum()
         if self._sampling != "adaptive":
             return self._share
         total = self.failures.sum()
         preferred = _UNIFORM_SHARE * self._share + (1.0 - _UNIFORM_SHARE) * self.failures / total.clamp_min(1e-12)
         return torch.where(total > 0.0, preferred, self._share)
+
+    def failure_rates(self) -> Tensor:
+        """Failures per env step of a world in each bin, (S,), as if all bins had been visited once more: each as often
+        as they are in the mean, and failing as often as they do in the mean. All 1 before the first failure."""
+        mean = self.failures.sum() / self.visits.sum().clamp_min(1e-12)
+        usual = self.visits.mean()
+        rates = (self.failures + usual * mean) / (self.visits + usual).clamp_min(1e-12)
+        return torch.where(mean > 0.0, rates, torch.ones_like(rates))
 
     def draw(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """First frames of N episodes and last frames of their clips, each (N,) int64.
@@ -202,11 +222,14 @@ class StartFrames:
         return self._references.firsts[clip] + within, self._references.lasts[clip]
 
     @torch.no_grad()
-    def failed_in(self, frame: Tensor, failed: Tensor) -> Tensor:
-        """Number of failures in each bin, (S,), in worlds at frames (W,) that have `failed` or not, (W,) bool."""
-        return torch.zeros_like(self.failures).index_add_(0, self._bin_of_frame[frame], failed.float())
+    def tally(self, frame: Tensor, failed: Tensor) -> Tensor:
+        """Failures and visits in each bin, (2, S), of worlds in frames (W,) that have `failed` or not, (W,) bool."""
+        worlds = torch.stack((failed.float(), torch.ones_like(failed, dtype=torch.float32)))
+        return worlds.new_zeros((2, len(self.failures))).index_add_(1, self._bin_of_frame[frame], worlds)
 
     @torch.no_grad()
-    def count(self, failed: Tensor) -> None:
-        """Add the failures of an env step, (S,), to the running mean."""
-        self.failures.lerp_(failed, _NEWEST_WEIGHT)
+    def count(self, tally: Tensor) -> None:
+        """Add the failures and visits of an env step, (2, S), to the running means."""
+        failures, visits = tally
+        self.failures.lerp_(failures, _NEWEST_WEIGHT)
+        self.visits.lerp_(visits, _NEWEST_WEIGHT)

@@ -103,13 +103,33 @@ def test_adaptive_starts_prefer_bins_with_failures() -> None:
     assert (first <= last).all()
     assert (first < 250).float().mean() == pytest.approx(250 / 350, abs=0.02)
     # Of two worlds, the one in frame 252, among the first frames of clip b, fails: that is the first bin of b.
-    starts.count(starts.failed_in(torch.tensor([252, 10]), torch.tensor([True, False])))
+    starts.count(starts.tally(torch.tensor([252, 10]), torch.tensor([True, False])))
     assert starts.failures.tolist() == pytest.approx([0.0] * 6 + [0.001, 0.0, 0.0])
+    assert starts.visits.tolist() == pytest.approx([0.001] + [0.0] * 5 + [0.001, 0.0, 0.0])
     chances = starts.chances()
     assert chances.sum() == pytest.approx(1.0)
     assert chances[6] > 0.5
     # A tenth of the starts goes anywhere: a bin of clip b has a third of its 99 of all 249 + 99 steps between frames.
     assert chances[6] == pytest.approx(0.9 + 0.1 * (99 / 3) / (249 + 99), abs=1e-6)
+
+
+def test_starts_by_the_failure_rate_lie_up_to_two_bins_before_the_failures() -> None:
+    library = Library(("a", "b"), (150, 100), torch.zeros(250, 58), torch.zeros(250, 14, 13))
+    starts = StartFrames(References(library, 0, torch.device("cpu")), 50.0, "failure_rate")
+    # Bins of a begin at frames 0, 37, 74, 111, those of b at 150, 183, 216; each is as wide as the others of its clip.
+    share = torch.tensor([149 / 4] * 4 + [99 / 3] * 3) / 248
+    torch.testing.assert_close(starts.chances(), share)
+    # Of five worlds, two are in the last bin of a, and one of them fails there; one is in the second of b.
+    frames = torch.tensor([120, 121, 1, 2, 190])
+    starts.count(starts.tally(frames, torch.tensor([True, False, False, False, False])))
+    # Failures per visit: one of five in all, and 5/7 world per bin; so (1 + 1/7) / (2 + 5/7) in that bin, 1/7 over 2 +
+    # 5/7, 1 + 5/7 and 5/7 in bins that two, one or no world visited.
+    rates = torch.tensor([1 / 19, 1 / 5, 1 / 5, 8 / 19, 1 / 5, 1 / 12, 1 / 5])
+    torch.testing.assert_close(starts.failure_rates(), rates)
+    # Means of each bin and the next two of its clip, of which the last one counts again.
+    ahead = torch.tensor([[0, 1, 2], [1, 2, 3], [2, 3, 3], [3, 3, 3], [4, 5, 6], [5, 6, 6], [6, 6, 6]])
+    chances = share * rates[ahead].mean(1)
+    torch.testing.assert_close(starts.chances(), chances / chances.sum())
 
 
 def test_steps_count_failures_and_checkpoints_keep_them() -> None:
@@ -123,6 +143,7 @@ def test_steps_count_failures_and_checkpoints_keep_them() -> None:
     other = make(4, **STILL)
     other.load_state_dict(env.state_dict())
     assert torch.equal(other.start_frames.failures, env.start_frames.failures)
+    assert torch.equal(other.start_frames.visits, env.start_frames.visits)
     assert torch.equal(other.frame(), env.frame())
     saved = {**env.state_dict(), "failures": torch.zeros(7)}
     with pytest.raises(ConfigError, match="have changed since this trial was saved"):
