@@ -1,4 +1,4 @@
-"""A policy that follows a motion, in C MuJoCo, without msk_ray; it needs onnxruntime, and two minutes for the dance:
+"""A policy that follows a motion, in C MuJoCo, without msk_ray; it needs onnxruntime, and ten seconds for the dance:
 
     msk-ray export g1_dance --onnx dance.onnx
     msk-ray motions g1/dance1_subject2.csv --npz .
@@ -26,7 +26,7 @@ for side in ("left", "right"):
 
 if len(sys.argv) != 4:
     sys.exit(__doc__)
-path, clip, action_range = Path(sys.argv[1]), np.load(sys.argv[2]), float(sys.argv[3])
+path, clip, action_range = Path(sys.argv[1]), dict(np.load(sys.argv[2])), float(sys.argv[3])
 about = json.loads(path.with_suffix(".json").read_text())
 shown = " ".join(entry["name"] for entry in about["observation"]["entries"])
 future = [int(ahead) for ahead in re.findall(r"\banchor_position_(\d+)_x\b", shown)]  # env.future_frames
