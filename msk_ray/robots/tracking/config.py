@@ -65,9 +65,9 @@ class G1TrackingSettings(ServoSettings):
     action_about: Literal["default", "reference"] = "default"
     """Joint targets for an action of 0: the default pose, as in mjlab, or the reference's angles."""
     sampling: Sampling = "adaptive"
-    """Where training episodes begin: anywhere, but more often where most episodes have failed (`adaptive`), or where
-    most of those that got there have (`failure_rate`); anywhere (`uniform`); or at the first frame of each motion
-    (`start`)."""
+    """Where training episodes begin: anywhere, but more often where episodes have failed, by their number (`adaptive`)
+    or by their share of those that got there (`failure_rate`); anywhere (`uniform`); or at the first frame of each
+    motion (`start`)."""
     score_sampling: Literal["uniform", "start"] = "uniform"
     """Where scored episodes begin."""
     failure: Failure = "mjlab"
