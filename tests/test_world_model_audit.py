@@ -66,7 +66,7 @@ def test_equal_gradients_have_cosine_and_size_one(audit: dict[str, Any]) -> None
 @pytest.mark.long
 def test_the_audit_runs(monkeypatch: Any, capsys: Any, tmp_path: Path) -> None:
     matplotlib.use("Agg")
-    tiny = ("--transitions", "60", "--horizons", "1", "2", "--worlds", "4", "--updates", "20", "--width", "16")
+    tiny = ("--transitions", "60", "--horizons", "1", "2", "--worlds", "4", "--updates", "2", "--width", "16")
     policy = ROOT / "policies" / "go1_velocity.pt"
     changed = ("--set", "env.episode_length=500")
     monkeypatch.setattr(sys, "argv", [EXAMPLE.name, str(policy), "--output", str(tmp_path), *changed, *tiny])
