@@ -8,7 +8,7 @@ import math
 import zlib
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Final, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import mujoco
 import numpy as np
@@ -23,7 +23,7 @@ _UNIFORM_SHARE = 0.1
 step, so that its share depends on the number of worlds."""
 _NEWEST_WEIGHT = 0.001
 """Weight of the newest env step in the running means of failures and visits."""
-_LEAD: Final = 2
+_LEAD = 2
 """A start by the failure rate may lie this many bins before the failures, so that the robot gets there by itself."""
 
 
@@ -181,9 +181,9 @@ class StartFrames:
         ]
         self._bin_of_frame = torch.from_numpy(np.concatenate(bins_of_frames)).to(device)
         self._share = (self._width / self._width.sum()).to(device)
-        last_bins = torch.from_numpy(first_bins).to(torch.int64) + torch.tensor(counts) - 1
-        ahead = torch.arange(len(clip))[:, None] + torch.arange(_LEAD + 1)
-        self._bins_ahead = torch.minimum(ahead, last_bins[clip][:, None]).to(device)
+        left_in_clip = bins_of_clip - 1 - place_in_clip
+        ahead = torch.minimum(torch.arange(_LEAD + 1), left_in_clip[:, None])
+        self._bins_ahead = (torch.arange(len(clip))[:, None] + ahead).to(device)
         self.failures = torch.zeros(len(clip), device=device)
         self.visits = torch.zeros(len(clip), device=device)
 
