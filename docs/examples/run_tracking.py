@@ -2,15 +2,13 @@
 
     msk-ray export g1_dance --onnx dance.onnx
     msk-ray motions g1/dance1_subject2.csv --npz .
-    python run_tracking.py dance.onnx dance1_subject2.npz 2
+    python run_tracking.py dance.onnx dance1_subject2.npz
 
-For policies with actions about the reference and `env.layout: full`. The number is their `env.action_range`: 2 in
-configs/g1_tracking.yaml, 4 in configs/g1_tracking_library.yaml. Prints how much of the clip was followed, and `motion`,
-the return without costs, as `msk-ray track` does.
+For policies with actions about the reference and `env.layout: full`. Prints how much of the clip was followed, and
+`motion`, the return without costs, as `msk-ray track` does.
 """
 
 import json
-import re
 import sys
 import time
 from pathlib import Path
@@ -24,14 +22,14 @@ for side in ("left", "right"):
     BODIES += [f"{side}_{part}_link" for part in ("hip_roll", "knee", "ankle_roll")]
     BODIES += [f"{side}_{part}_link" for part in ("shoulder_roll", "elbow", "wrist_yaw")]
 
-if len(sys.argv) != 4:
+if len(sys.argv) != 3:
     sys.exit(__doc__)
-path, clip, action_range = Path(sys.argv[1]), dict(np.load(sys.argv[2])), float(sys.argv[3])
+path, clip = Path(sys.argv[1]), dict(np.load(sys.argv[2]))
 about = json.loads(path.with_suffix(".json").read_text())
-shown = " ".join(entry["name"] for entry in about["observation"]["entries"])
-future = [int(ahead) for ahead in re.findall(r"\banchor_position_(\d+)_x\b", shown)]  # env.future_frames
-if about["observation"]["size"] != 160 + 67 * len(future):
-    sys.exit(f"{path}: not for this observation: train with env.layout full, without history")
+settings = about["trained"]["env_settings"]
+future = settings["future_frames"]
+if settings["layout"] != "full" or settings["action_about"] != "reference":
+    sys.exit(f"{path}: not for this policy: train with env.layout full and env.action_about reference")
 model = mujoco.MjModel.from_binary_path(str(path.with_suffix(".mjb")))
 policy = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 data = mujoco.MjData(model)
@@ -98,7 +96,7 @@ for frame in range(frames):
         *(part for ahead in future for part in seen(min(frame + ahead, frames - 1))),
     ]
     (output,) = policy.run(["action"], {"obs": np.concatenate(obs)[None].astype(np.float32)})
-    action = action_range * output[0] + (clip["joint_pos"][frame] - default) / unit
+    action = settings["action_range"] * output[0] + (clip["joint_pos"][frame] - default) / unit
     data.ctrl[servos] = default + unit * action
     mujoco.mj_step(model, data, about["physics_steps_per_control"])
     mujoco.mj_forward(model, data)

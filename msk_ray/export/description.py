@@ -83,6 +83,7 @@ def describe(
             "epoch": saved.epoch,
             "env_steps": saved.env_steps,
             "env": saved.config.env.name,
+            "env_settings": saved.config.env.model_dump(mode="json"),
             "algorithm": saved.config.algorithm.name,
             "msk_ray": msk_ray.__version__,
         },

@@ -66,6 +66,8 @@ def test_description_and_model_say_what_another_program_needs(exported: Path) ->
         ("cart_velocity", "m/s"),
     ]
     assert about["files"] == {"onnx": "p.onnx", "model": "p.mjb"}
+    assert (about["trained"]["env"], about["trained"]["env_settings"]["name"]) == ("cartpole", "cartpole")
+    assert about["trained"]["env_settings"]["control_timestep"] == about["control_period_s"]
     assert about["memory"] == []
     assert about["action"]["names"] == about["ctrl"]["names"] == ["force"]
     assert about["ctrl"]["ranges"] == [[-1.0, 1.0]]

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from msk_ray.envs import make_env
 from msk_ray.errors import ConfigError
 from msk_ray.evaluate.__main__ import main
 from msk_ray.evaluate.stored import read_evaluations
-from msk_ray.robots.mjlab.scoring import mjlab_actions, motion_of, task_of
+from msk_ray.robots.mjlab.mjlab_side import with_future
+from msk_ray.robots.mjlab.scoring import PLAY, MjlabScorer, mjlab_actions, motion_of, task_of
 from msk_ray.robots.tracking.env import G1Tracking
 from msk_ray.training import Trainer, load_policy
 
@@ -179,8 +181,8 @@ def test_a_policy_that_follows_a_clip_has_mjlabs_layout_and_actions() -> None:
         "g1_tracking", ["env.layout=no_state_estimation", "env.action_about=default", "env.action_range=1.0"]
     )
     assert task_of(other) == "Mjlab-Tracking-Flat-Unitree-G1-No-State-Estimation"
-    with pytest.raises(ConfigError, match=r"not with env.future_frames"):
-        task_of(load_config("g1_tracking", ["env.future_frames=[1]"]))
+    with pytest.raises(ConfigError, match=r"not with env.mirror"):
+        task_of(load_config("g1_tracking", ["env.mirror=true"]))
     env = make_env(config.env, config.physics, 2, "cpu", 0, differentiable=False)
     assert isinstance(env, G1Tracking)
     obs, action = env.observation().numpy(), np.linspace(-1.0, 1.0, 58, dtype=np.float32).reshape(2, 29)
@@ -193,6 +195,17 @@ def test_a_policy_that_follows_a_clip_has_mjlabs_layout_and_actions() -> None:
             assert arrays["body_pos_w"].shape == (200, 30, 3)
     with motion_of(load_config("go1_velocity")) as motion:
         assert motion is None
+
+
+def test_later_frames_are_seen_with_the_noise_of_the_present() -> None:
+    command = SimpleNamespace(time_steps=torch.tensor([0, 8]))
+    # In frame f, mjlab shows f and 10 f, then what is not of the reference.
+    obs = torch.tensor([[0.5, 0.0, 7.0], [8.0, 79.0, 7.0]])
+    seen = with_future(
+        command, lambda: torch.stack((command.time_steps, 10 * command.time_steps), -1).float(), obs, [1, 3], 9
+    )
+    assert seen.tolist() == [[0.5, 0.0, 7.0, 1.5, 10.0, 3.5, 30.0], [8.0, 79.0, 7.0, 9.0, 89.0, 9.0, 89.0]]
+    assert command.time_steps.tolist() == [0, 8]
 
 
 def _own_python(root: Path) -> Path:
@@ -209,6 +222,39 @@ def test_a_policy_is_scored_in_the_real_mjlab(trial: Path, root: Path) -> None:
     play, _ = (entry for entry in entries(trial) if entry["steps"] == 5 and entry["worlds"] == 2)
     assert play["scores"][0] != play["scores"][1]
     assert play["mjlab"]["mujoco"].startswith("3.11.")
+
+
+def test_a_clip_begins_with_the_same_observation_in_the_real_mjlab(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    python = _own_python(root)
+    few = ["env.nworld=2", "shac.horizon=2", "actor.hidden=[8]", "critic.hidden=[8]", "evaluation.nworld=1"]
+    config = load_config("g1_tracking", [*few, "env.score_sampling=start", "env.stochastic_reset=false"])
+    trainer = Trainer(config, tmp_path / "trial", "cpu")
+    policy = load_policy(trainer.save())
+    trainer.close()
+    given: list[np.ndarray] = []
+    act = type(policy).__call__
+    monkeypatch.setattr(type(policy), "__call__", lambda self, obs: (given.append(obs), act(self, obs))[1])
+    scorer = MjlabScorer(python)
+    scorer.evaluate(policy, next(each for each in scorer.requests(1, None, 2) if each.physics == PLAY))
+    # mjlab begins with the reference one frame further, and with noise in the joints: how the reference will move, in
+    # the axes of its own torso, does not depend on where the robot is.
+    start = config.env.model_copy(update={"sampling": "start", "future_frames": (1, 3, 6, 11, 21)})
+    env = make_env(start, config.physics, 1, "cpu", 0, differentiable=False)
+    ours, seen = env.observation()[0, 160:].view(5, 67), torch.from_numpy(given[0][0])
+    seen = torch.cat((seen[:67], seen[160:])).view(5, 67)
+    torch.testing.assert_close(seen[:, :58], ours[:, :58])
+    for before, after in zip(_moved(seen), _moved(ours), strict=True):
+        torch.testing.assert_close(before, after, atol=1e-5, rtol=0.0)
+    assert (seen[1:, 60] < seen[0, 60] - 1e-4).all(), "a squat goes down"
+
+
+def _moved(entries: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions and orientations of the torso in entries (F, 67), in its axes in the first of them."""
+    x, y = entries[:, 61:].view(-1, 3, 2).unbind(-1)
+    turns = torch.stack((x, y, torch.linalg.cross(x, y)), dim=-1)
+    return (entries[:, 58:61] - entries[0, 58:61]) @ turns[0], turns[0].T @ turns
 
 
 @pytest.mark.slow

@@ -1,9 +1,9 @@
 """Runs episodes of an unmodified task of mjlab for `scoring`, in a Python that has mjlab.
 
 That Python has another version of MuJoCo and lacks this package, so this file imports nothing from it. It is started
-with one JSON argument {task, seed, worlds, steps, pushed, motion, sampling}. On standard output it writes a line of
-JSON that says what it runs, then the first observations of all worlds, and after each step a `record` of each world. On
-standard input it reads the actions of all worlds before each step. mjlab's own messages go to standard error.
+with one JSON argument {task, seed, worlds, steps, pushed, motion, sampling, future}. On standard output it writes a
+line of JSON that says what it runs, then the first observations of all worlds, and after each step a `record` of each
+world. On standard input it reads the actions of all worlds before each step. mjlab's own messages go to standard error.
 """
 
 import importlib.metadata
@@ -89,6 +89,49 @@ def task_for_scoring(  # type: ignore[no-untyped-def]
     return env, errors
 
 
+def with_future(command, shown, obs, future, last):  # type: ignore[no-untyped-def]
+    """What a policy with `env.future_frames` sees: mjlab's observations, then their first entries for later frames.
+
+    Args:
+        command: mjlab's command, whose `time_steps` (W,) say which frame each world is in.
+        shown: function that gives the entries (W, E) for the frames in `time_steps`, without noise.
+        obs: observations (W, O), whose first E entries are `shown`, perhaps with noise; later frames get the same
+            noise, because it is an error of where the robot believes to be.
+        future: how many env steps ahead.
+        last: the last frame.
+
+    Returns:
+        (W, O + E × number of later frames).
+    """
+    import torch
+
+    now = command.time_steps
+    present = shown()
+    error, parts = obs[:, : present.shape[1]] - present, [obs]
+    for ahead in future:
+        command.time_steps = (now + ahead).clamp_max(last)
+        parts.append(shown() + error)
+    command.time_steps = now
+    return torch.cat(parts, dim=-1)
+
+
+def policy_view(env, motion, future):  # type: ignore[no-untyped-def]
+    """A function from the observations that mjlab gives to those that the policy sees, as `with_future`."""
+    if not future:
+        return lambda obs: obs["actor"]
+    import torch
+    from mjlab.tasks.tracking.mdp import motion_anchor_ori_b, motion_anchor_pos_b
+
+    command = env.command_manager.get_term(command_name(motion))
+    placed = "motion_anchor_pos_b" in env.observation_manager.active_terms["actor"]
+    terms = [motion_anchor_pos_b, motion_anchor_ori_b] if placed else [motion_anchor_ori_b]
+
+    def shown():  # type: ignore[no-untyped-def]
+        return torch.cat([command.command, *(term(env, "motion") for term in terms)], dim=-1)
+
+    return lambda obs: with_future(command, shown, obs["actor"], future, command.motion.time_step_total - 1)
+
+
 def command_name(motion: str | None) -> str:
     """mjlab's name for the command of a task with or without a motion."""
     return "twist" if motion is None else "motion"
@@ -109,9 +152,10 @@ def main() -> None:
     env, errors = task_for_scoring(
         order["task"], order["pushed"], worlds, order["seed"], device, motion, order["sampling"]
     )
-    obs, _ = env.reset()
+    view = policy_view(env, motion, order["future"])
+    obs = view(env.reset()[0])
     terms = env.reward_manager.active_terms
-    observations, actions = obs["actor"].shape[1], env.action_manager.total_action_dim
+    observations, actions = obs.shape[1], env.action_manager.total_action_dim
     hello = {
         "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
         "device": torch.cuda.get_device_name(0) if device != "cpu" else "cpu",
@@ -120,14 +164,14 @@ def main() -> None:
         "terms": terms,
     }
     answers.write(json.dumps(hello).encode() + b"\n")
-    answers.write(obs["actor"].cpu().numpy().astype("<f4").tobytes())
+    answers.write(obs.cpu().numpy().astype("<f4").tobytes())
     answers.flush()
     answer = np.zeros(worlds, record(observations, len(terms), command_name(motion)))
     for _ in range(order["steps"]):
         action = np.frombuffer(sys.stdin.buffer.read(4 * worlds * actions), "<f4").reshape(worlds, actions)
         obs, reward, terminated, _, _ = env.step(torch.from_numpy(action.copy()).to(device))
         weighted = env.reward_manager._step_reward * env.step_dt
-        results = {"reward": reward, "terms": weighted, "terminated": terminated, "obs": obs["actor"], **errors}
+        results = {"reward": reward, "terms": weighted, "terminated": terminated, "obs": view(obs), **errors}
         for name, value in results.items():
             answer[name] = value.cpu().numpy()
         answers.write(answer.tobytes())

@@ -66,11 +66,8 @@ def task_of(config: Config) -> str:
             "env.control_timestep"
         )
     if isinstance(env, G1TrackingSettings):
-        if env.future_frames or env.mirror:
-            raise ConfigError(
-                "--in mjlab: mjlab shows no future frames and follows one clip: not with "
-                f"env.{'future_frames' if env.future_frames else 'mirror'}"
-            )
+        if env.mirror:
+            raise ConfigError("--in mjlab: mjlab follows one clip, not its mirror image too: not with env.mirror")
         task += {"full": "", "no_state_estimation": "-No-State-Estimation"}[env.layout]
     return task
 
@@ -150,6 +147,7 @@ class MjlabScorer:
             "worlds": request.worlds,
             "steps": request.steps,
             "sampling": env.score_sampling if isinstance(env, G1TrackingSettings) else None,
+            "future": env.future_frames if isinstance(env, G1TrackingSettings) else (),
         }
         runs = []
         with motion_of(policy.config) as motion:
@@ -208,7 +206,7 @@ class _MjlabProcess(ForeignProcess):
             pace(done)
             if not running.any():
                 break
-            obs = np.ascontiguousarray(step["obs"])
+            obs = step["obs"].copy()
         diverged = ~np.isfinite(sums["reward"])
         return Episodes(
             score=torch.from_numpy(sums["reward"]),

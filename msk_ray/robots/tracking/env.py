@@ -167,7 +167,7 @@ class G1Tracking(ServoEnv[G1TrackingSettings]):
     def step(self, action: Tensor, *, auto_reset: bool = True) -> Transition:
         frame = self.frame()
         transition = super().step(action, auto_reset=auto_reset)
-        if self.config.sampling in ("adaptive", "failure_rate"):
+        if self.config.sampling == "failure_rate":
             tally = self.start_frames.tally(frame, transition.terminated)
             self.group.mean([tally])
             self.start_frames.count(tally)

@@ -18,9 +18,6 @@ from torch import Tensor
 from msk_ray.robots.tracking.config import G1TrackingSettings, Sampling
 from msk_ray.robots.tracking.motions import BUILTIN, Clip, body_names, motion_files, read_motions
 
-_UNIFORM_SHARE = 0.1
-"""Share of adaptive starts that are drawn anywhere. mjlab instead adds 0.1 to the failures that all worlds have in a
-step, so that its share depends on the number of worlds."""
 _NEWEST_WEIGHT = 0.001
 """Weight of the newest env step in the running means of failures and visits."""
 _LEAD = 2
@@ -147,10 +144,9 @@ class References:
 class StartFrames:
     """Draws the frames in which episodes begin.
 
-    Clips are divided into bins of about a second. An adaptive draw prefers bins in which many episodes have failed; one
-    by the failure rate prefers those in which many of the episodes that got there have, and the two bins before.
-    Failures and visits are averaged in tensors that are changed in place, so that epochs recorded as CUDA graphs count
-    too.
+    Clips are divided into bins of about a second. A draw by the failure rate prefers bins in which many of the episodes
+    that got there have failed, and the two bins before. Failures and visits are averaged in tensors that are changed in
+    place, so that epochs recorded as CUDA graphs count too.
 
     Args:
         references: the clips.
@@ -189,14 +185,10 @@ class StartFrames:
 
     def chances(self) -> Tensor:
         """The probability that an episode begins in each bin, (S,)."""
-        if self._sampling == "failure_rate":
-            rates = self._share * self.failure_rates()[self._bins_ahead].mean(1)
-            return rates / rates.sum()
-        if self._sampling != "adaptive":
+        if self._sampling == "uniform":
             return self._share
-        total = self.failures.sum()
-        preferred = _UNIFORM_SHARE * self._share + (1.0 - _UNIFORM_SHARE) * self.failures / total.clamp_min(1e-12)
-        return torch.where(total > 0.0, preferred, self._share)
+        rates = self._share * self.failure_rates()[self._bins_ahead].mean(1)
+        return rates / rates.sum()
 
     def failure_rates(self) -> Tensor:
         """Failures per env step of a world in each bin, (S,), as if all bins had been visited once more: each as often
