@@ -1,4 +1,4 @@
-"""`msk-ray track`: scores of a policy on each clip, by the rules of SuperMimic (`clip_scores.py`)."""
+"""`msk-ray track`: scores of a policy on each clip (`clip_scores.py`)."""
 
 import csv
 import sys
