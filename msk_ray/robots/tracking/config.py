@@ -75,8 +75,8 @@ class G1TrackingSettings(ServoSettings):
     foot is far off (`mjlab`), or when the height or tilt of the pelvis is (`pelvis`)."""
     drift_limit: PositiveFloat | None = None
     """Training episodes also end when the torso is farther than this, horizontally, from the reference's [m]. Without
-    it, a robot that walks more slowly than a motion loses little, because the reward for the torso's position has hardly
-    any slope far from it."""
+    it, a robot that walks more slowly than a motion loses little, because the reward for the torso's position has
+    hardly any slope far from it."""
     score_failure: Failure = "mjlab"
     """When a scored episode ends early."""
     reward: TrackingShape = TrackingShape()
