@@ -27,9 +27,11 @@ if len(sys.argv) != 3:
 path, clip = Path(sys.argv[1]), dict(np.load(sys.argv[2]))
 about = json.loads(path.with_suffix(".json").read_text())
 settings = about["trained"]["env_settings"]
-future = settings["future_frames"]
-if settings["layout"] != "full" or settings["action_about"] != "reference":
-    sys.exit(f"{path}: not for this policy: train with env.layout full and env.action_about reference")
+future = settings.get("future_frames", [])
+if about["observation"]["size"] != 160 + 67 * len(future):
+    sys.exit(f"{path}: not for this observation: train with env.layout full, without history")
+if settings["action_about"] != "reference":
+    sys.exit(f"{path}: not for these actions: train with env.action_about reference")
 model = mujoco.MjModel.from_binary_path(str(path.with_suffix(".mjb")))
 policy = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 data = mujoco.MjData(model)

@@ -224,7 +224,7 @@ def test_a_policy_is_scored_in_the_real_mjlab(trial: Path, root: Path) -> None:
     assert play["mjlab"]["mujoco"].startswith("3.11.")
 
 
-def test_a_clip_begins_with_the_same_observation_in_the_real_mjlab(
+def test_later_frames_are_the_same_in_the_real_mjlab(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     python = _own_python(root)

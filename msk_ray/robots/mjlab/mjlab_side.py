@@ -115,14 +115,14 @@ def with_future(command, shown, obs, future, last):  # type: ignore[no-untyped-d
     return torch.cat(parts, dim=-1)
 
 
-def policy_view(env, motion, future):  # type: ignore[no-untyped-def]
+def policy_view(env, future):  # type: ignore[no-untyped-def]
     """A function from the observations that mjlab gives to those that the policy sees, as `with_future`."""
     if not future:
         return lambda obs: obs["actor"]
     import torch
     from mjlab.tasks.tracking.mdp import motion_anchor_ori_b, motion_anchor_pos_b
 
-    command = env.command_manager.get_term(command_name(motion))
+    command = env.command_manager.get_term("motion")
     placed = "motion_anchor_pos_b" in env.observation_manager.active_terms["actor"]
     terms = [motion_anchor_pos_b, motion_anchor_ori_b] if placed else [motion_anchor_ori_b]
 
@@ -152,7 +152,7 @@ def main() -> None:
     env, errors = task_for_scoring(
         order["task"], order["pushed"], worlds, order["seed"], device, motion, order["sampling"]
     )
-    view = policy_view(env, motion, order["future"])
+    view = policy_view(env, order["future"])
     obs = view(env.reset()[0])
     terms = env.reward_manager.active_terms
     observations, actions = obs.shape[1], env.action_manager.total_action_dim

@@ -141,13 +141,14 @@ class MjlabScorer:
         assert request.steps is not None
         seeds = request.seeds or (0,)
         env = policy.config.env
+        tracking = env if isinstance(env, G1TrackingSettings) else None
         order = {
             "task": task,
             "pushed": request.physics == PUSHED,
             "worlds": request.worlds,
             "steps": request.steps,
-            "sampling": env.score_sampling if isinstance(env, G1TrackingSettings) else None,
-            "future": env.future_frames if isinstance(env, G1TrackingSettings) else (),
+            "sampling": tracking.score_sampling if tracking else None,
+            "future": tracking.future_frames if tracking else (),
         }
         runs = []
         with motion_of(policy.config) as motion:
