@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 List motions of Unitree's G1: their duration, number of frames, and what is wrong with them (joints beyond their ranges,
-body parts inside the ground or each other). A file that holds no motion of this robot is refused in one line.
+body parts inside the ground or each other, hovering). A file that holds no motion of this robot is refused in one line.
 
 Files are CSV at 30 Hz with one frame a line, as in Unitree's retargeted LAFAN1 (position, quaternion x, y, z, w, 29
 joint angles), or NPZ from mjlab's csv_to_npz. Also draws a picture with a row of frames for each motion."""
@@ -59,7 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     from msk_ray.config import PhysicsConfig
     from msk_ray.robots.tracking.config import G1TrackingSettings
     from msk_ray.robots.tracking.env import G1Tracking
-    from msk_ray.robots.tracking.motions import Clip, remarks
+    from msk_ray.robots.tracking.motion_remarks import remarks
+    from msk_ray.robots.tracking.motions import Clip
 
     settings = G1TrackingSettings(name="g1_tracking")
     model = G1Tracking.build_model(settings, PhysicsConfig())

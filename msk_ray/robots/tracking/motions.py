@@ -1,4 +1,4 @@
-"""Motions of a robot: reads, checks, resamples, cuts and mirrors them, and computes how each body moves.
+"""Motions of a robot: reads, resamples, cuts and mirrors them, and computes how each body moves.
 
 Velocities are finite differences, as in mjlab's `csv_to_npz`; poses of bodies come from the simulation's kinematics.
 
@@ -34,16 +34,10 @@ _MAX_BYTES: Final = 2**28
 _MIN_FRAMES: Final = 3
 _NORM_TOLERANCE: Final = 0.01
 """Largest deviation of a quaternion's norm from 1 that is not refused."""
-_RANGE_TOLERANCE: Final = 0.02
-"""Largest angle beyond a joint's range that is not reported [rad]."""
 _WRONG_ORDER: Final = 0.5
 """Angle beyond a joint's range [rad] that, in a tenth of the frames, means that joints are in another order."""
-_DEPTH_TOLERANCE: Final = 0.03
-"""Largest depth in the ground, or in another part of the robot, that is not reported [m]."""
 _BATCH: Final = 4096
 """Frames whose bodies are placed at once."""
-_CONTACT_STRIDE: Final = 5
-"""Contacts are looked for in every fifth frame, because that is slow."""
 
 
 @dataclass(frozen=True)
@@ -290,37 +284,6 @@ def beyond_range(motion: Motion, model: mujoco.MjModel) -> Array:
     """Angles beyond the ranges of the joints [rad], (F, J)."""
     low, high = model.jnt_range[1:].T
     return np.maximum(np.maximum(low - motion.joints, motion.joints - high), 0.0)
-
-
-def remarks(motion: Motion, model: mujoco.MjModel) -> list[str]:
-    """What is wrong with a motion that can be followed nevertheless, one line for each fault."""
-    lines = []
-    excess = beyond_range(motion, model)
-    if (worst := float(excess.max())) > _RANGE_TOLERANCE:
-        joint = int(excess.max(0).argmax())
-        share = float((excess > _RANGE_TOLERANCE).any(1).mean())
-        lines.append(f"{model.joint(joint + 1).name} up to {worst:.2f} rad beyond its range, any joint in {share:.0%}")
-    ground, itself = depths(motion, model).T
-    for depth, where in ((ground, "the ground"), (itself, "itself")):
-        if (deepest := float(depth.max())) > _DEPTH_TOLERANCE:
-            share, tolerance_cm = float((depth > _DEPTH_TOLERANCE).mean()), 100.0 * _DEPTH_TOLERANCE
-            lines.append(f"up to {100.0 * deepest:.0f} cm in {where}, over {tolerance_cm:.0f} cm in {share:.0%}")
-    return lines
-
-
-def depths(motion: Motion, model: mujoco.MjModel) -> Array:
-    """Depth of the robot in the ground, and of its parts in each other [m], in every fifth frame, (F / 5, 2)."""
-    data = mujoco.MjData(model)
-    is_ground = model.body_weldid[model.geom_bodyid] == 0
-    deepest = []
-    for qpos in motion.qpos[::_CONTACT_STRIDE]:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        contact = data.contact
-        on_ground = is_ground[contact.geom].any(-1) if data.ncon else np.zeros(0, bool)
-        deepest.append([max((0.0, *(-contact.dist[chosen]))) for chosen in (on_ground, ~on_ground)])
-    return np.array(deepest)
 
 
 def slerp(start: Array, end: Array, share: Array) -> Array:

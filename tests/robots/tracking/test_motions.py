@@ -9,7 +9,8 @@ import pytest
 
 from msk_ray.errors import ConfigError
 from msk_ray.robots.tracking import motions
-from msk_ray.robots.tracking.motions import Clip, Motion, body_names, read_motion, read_motions, remarks, slerp
+from msk_ray.robots.tracking.motion_remarks import hovering, remarks
+from msk_ray.robots.tracking.motions import Clip, Motion, body_names, read_motion, read_motions, slerp
 
 SCENE = Path(__file__).parents[3] / "msk_ray" / "robots" / "scenes" / "g1_flat.xml"
 
@@ -151,5 +152,18 @@ def test_remarks_name_joints_out_of_range_and_parts_in_the_ground_or_in_each_oth
     crossed = squat.joints.copy()
     crossed[:, 1], crossed[:, 7] = -0.3, 0.3  # hips roll the legs into each other
     crossed_legs = replace(squat, joints=crossed, position=np.add(squat.position, (0.0, 0.0, 0.5)))
-    (remark,) = remarks(crossed_legs, model)
-    assert remark.endswith("cm in itself, over 3 cm in 100%")
+    in_itself, hovers = remarks(crossed_legs, model)
+    assert in_itself.endswith("cm in itself, over 3 cm in 100%")
+    assert hovers == "hovers for 4.0 s, 4.0 s of it from 0.0 s"
+
+
+@pytest.mark.parametrize(("gravity", "spans"), [(9.81, []), (3.0, [(1.0, 0.5)])])
+def test_a_jump_hovers_if_it_falls_more_slowly_than_gravity_allows(
+    gravity: float, spans: list[tuple[float, float]], model: mujoco.MjModel, squat: Motion
+) -> None:
+    frames = np.arange(30, 45)  # 0.5 s from 1 s on; at the jump's ends the feet are 5 cm above the ground
+    times = (frames - 37) / squat.rate
+    standing, position = (np.repeat(values[:1], len(squat), axis=0) for values in (squat.joints, squat.position))
+    position[frames, 2] += 0.05 + 0.5 * gravity * (times[0] ** 2 - times**2)
+    jump = replace(squat, joints=standing, position=position)
+    assert hovering(jump, model) == spans
